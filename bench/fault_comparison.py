@@ -63,7 +63,7 @@ from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.robot.interface import RobotState
-from t3mpc_ros.simulation.fault_injection import FaultEvent
+from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 DURATION, BEGIN, NAMED = 30.0, 15.0, 5.0
 """Length of a run, begin of what does not last for the whole run, and time to name it, s."""

@@ -36,8 +36,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import StepperControllerParameters
+from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import WorkerPool

@@ -38,7 +38,8 @@ from t3mpc_ros.evaluation.patrol.tracking_study import errors_of
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_smoothing import SmoothedPath
-from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample, time_path
+from t3mpc_ros.geometry.path_timing import time_path
+from t3mpc_ros.geometry.polyline import check_points, polyline_length, resample
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose
 
 GEOMETRY = WheelGeometry()

@@ -52,7 +52,7 @@ from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change
 from t3mpc_ros.localization.localizer import Localizer
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import WORLDS_FOLDER, MovingDisc, World, cast_rays, load_world
 

@@ -46,7 +46,7 @@ from t3mpc_ros.cli.process_group import PrivateGraph
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 
 FULL = 0.35
 """Speed with both wheels at their maximum of 10 rad/s, m/s."""
@@ -115,7 +115,10 @@ class DrivenRobot:
         self._publisher = node.create_publisher(Twist, f'{self._namespace}/cmd_vel', 1)
         self._node, self._joints = node, []
         node.create_subscription(
-            JointState, f'{self._namespace}/joint_states', self._joints.append, qos.SCALARS
+            JointState,
+            f'{self._namespace}/joint_states',
+            self._joints.append,
+            topic_endpoints.SCALARS,
         )
         self.speed = None
         """Commanded speed, m/s; None: the publisher is gone."""

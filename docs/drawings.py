@@ -25,7 +25,7 @@ from xml.sax.saxutils import escape
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 IMAGES = Path(__file__).resolve().parent / 'images'

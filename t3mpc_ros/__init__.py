@@ -30,15 +30,16 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution, chaos
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison, compare
     from t3mpc_ros.evaluation.api.fuzzy_system import FuzzySystem, fuzzy
+    from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
     from t3mpc_ros.evaluation.api.own_reference import Waypoints
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
-    from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace
+    from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
     from t3mpc_ros.evaluation.api.script_parts import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.cases import LinkFaults
     from t3mpc_ros.script_error import ScriptError
-    from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
+    from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule
 
 __version__ = VERSION
 __all__ = [
@@ -74,14 +75,15 @@ _HOMES = {
     'evaluation.api.chaos_generator': ('ChaosSolution', 'chaos'),
     'evaluation.api.comparison_runs': ('Comparison', 'compare'),
     'evaluation.api.fuzzy_system': ('FuzzySystem', 'fuzzy'),
-    'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
-    'evaluation.api.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
+    'evaluation.api.noise_law': ('NoiseLaw',),
     'evaluation.api.own_reference': ('Waypoints',),
+    'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
+    'evaluation.api.plants': ('OdePlant', 'Robot', 'StateSpace'),
     'evaluation.api.script_parts': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),
     'evaluation.cases': ('LinkFaults',),
-    'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),
+    'simulation.fault_schedule': ('FaultEvent', 'FaultSchedule'),
     _BASELINE: ('NominalModel', 'Observation'),
 }
 _MODULE = {name: module for module, names in _HOMES.items() for name in names}

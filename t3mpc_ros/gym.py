@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
-from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import LinkFaults
@@ -37,7 +37,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.script_error import ScriptError
-from t3mpc_ros.simulation.fault_injection import FaultSchedule
+from t3mpc_ros.simulation.fault_schedule import FaultSchedule
 
 try:
     import gymnasium

@@ -25,7 +25,7 @@ import pytest
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
 from t3mpc_ros.nodes.registry import with_parameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'

@@ -93,7 +93,6 @@ SHARED_BASENAMES = {
     'fault_injection': 'faults injected into the twin, and into the emulated board',
     'localizer': 'the localizer, and the node that runs it',
     'player': 'the playback of bags, and the node that plays them',
-    'qos': 'QoS profiles, in bags and of publishers and subscriptions',
 }
 MAX_CLOSURE = 42
 """Maximum number of modules of the package that the controller node imports."""

@@ -28,7 +28,8 @@ from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
 from t3mpc_ros.geometry.path_smoothing import LEAST_TOLERANCE, SmoothedPath
-from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, PathTiming, check_points
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, PathTiming
+from t3mpc_ros.geometry.polyline import check_points
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 

@@ -39,7 +39,7 @@ from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_
 if TYPE_CHECKING:  # help and completion do without the libraries for bags, which load slowly
     from t3mpc_ros.bag.reader import BagReader
     from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryResult
-    from t3mpc_ros.evaluation.process_replay.controller_replay import ControllerInputs
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import ControllerInputs
     from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 
 
@@ -435,7 +435,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 def _changed_inputs(options: argparse.Namespace) -> tuple['ControllerInputs', dict[str, object]]:
     """Return the inputs of the recorded controller, and the parameters that are to change."""
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.model_file import load_model
 
     changes = parse_assignments(ControllerParameters, options.parameters)
@@ -513,7 +513,11 @@ def _add_compare(commands: Commands) -> None:
 
 def _run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
-    from t3mpc_ros.evaluation.process_replay import controller_replay, replay_comparison
+    from t3mpc_ros.evaluation.process_replay import (
+        controller_inputs,
+        controller_replay,
+        replay_comparison,
+    )
 
     tolerances = _tolerances(options)
     inputs, changes = _changed_inputs(options)
@@ -521,7 +525,7 @@ def _run_compare(options: argparse.Namespace) -> int:
     if options.other is not None:
         if changed:
             raise ValueError('--set and --model are for a replay: give one bag only')
-        other = controller_replay.load_inputs(options.other, options.namespace)
+        other = controller_inputs.load_inputs(options.other, options.namespace)
         outcome = replay_comparison.compare_bags(inputs, other, tolerances)
     else:
         again = controller_replay.replay_controller(inputs, changes)

@@ -35,7 +35,7 @@ from t3mpc_ros.cli.shared_options import (
 from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_checks import file_errors, read_yaml
+from t3mpc_ros.parameters.yaml_file import file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -47,9 +47,10 @@ from t3mpc_ros.radio.tool import (
     manoeuvre,
     procedure,
     robot_info,
+    robot_settings,
 )
-from t3mpc_ros.radio.tool.eeprom_records import StoredSettings
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
+from t3mpc_ros.radio.tool.robot_settings import StoredSettings
 from t3mpc_ros.stop_signal import StopSignal
 
 EXIT_OK, EXIT_POOR, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -141,22 +142,22 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     compared = _load_settings(options.diff) if options.diff is not None else None
     if options.save is not None:
         command_line.check_writable(options.save)
-    stored = _run_at_board(eeprom_records.read_settings(), options, stop)
+    stored = _run_at_board(robot_settings.read_settings(), options, stop)
     if loaded is not None or changes:
         base = loaded._asdict() if loaded is not None else {}
-        wanted = eeprom_records.change_settings(stored, {**base, **changes}, os.urandom)
+        wanted = robot_settings.change_settings(stored, {**base, **changes}, os.urandom)
         stored = _store_settings(stored, wanted, options, stop)
-    print(eeprom_records.format_settings(stored))
+    print(robot_settings.format_settings(stored))
     if options.save is not None:
         if not stored.valid:
             raise ProcedureError('there are no settings to save: give the microsteps, or --load')
-        write_atomically(options.save, eeprom_records.settings_file(stored.content))
+        write_atomically(options.save, robot_settings.settings_file(stored.content))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'
         )
     if compared is not None:
-        changed = eeprom_records.differences(stored.content, compared)
+        changed = robot_settings.differences(stored.content, compared)
         print(changed or f'equal to {options.diff}')
         if changed:
             return EXIT_POOR
@@ -165,17 +166,17 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _store_settings(
     stored: StoredSettings,
-    wanted: eeprom_records.RobotSettings,
+    wanted: robot_settings.RobotSettings,
     options: argparse.Namespace,
     stop: StopSignal,
 ) -> StoredSettings:
-    changed = eeprom_records.differences(stored.content, wanted)
+    changed = robot_settings.differences(stored.content, wanted)
     if stored.state == frames.SETTINGS_GOOD and not changed:
         return stored
-    print(changed if stored.valid else eeprom_records.SETTINGS_TEXTS[stored.state])
+    print(changed if stored.valid else robot_settings.SETTINGS_TEXTS[stored.state])
     if not options.yes and not _ask('Write this to the robot?', stop):
         raise ProcedureError('nothing was written')
-    return _run_at_board(eeprom_records.write_settings(wanted), options, stop)
+    return _run_at_board(robot_settings.write_settings(wanted), options, stop)
 
 
 def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -184,9 +185,9 @@ def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
     return EXIT_OK
 
 
-def _load_settings(path: Path) -> eeprom_records.RobotSettings:
+def _load_settings(path: Path) -> robot_settings.RobotSettings:
     with file_errors(path, ParameterError):
-        return eeprom_records.settings_of_file(read_yaml(path))
+        return robot_settings.settings_of_file(read_yaml(path))
 
 
 def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -352,7 +353,7 @@ def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], obj
     def parse(text: str) -> object:
         try:
             value = convert(text)
-            eeprom_records.check_settings(eeprom_records.RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
+            robot_settings.check_settings(robot_settings.RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return value
@@ -446,7 +447,7 @@ def _add_settings_commands(commands: Commands) -> None:
     add('--port', required=True, help='USB port of the robot board')
     add(
         '--address',
-        type=_setting('address', eeprom_records.parse_address),
+        type=_setting('address', robot_settings.parse_address),
         metavar='HEX',
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )

@@ -27,7 +27,7 @@ from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_checks import file_errors, parameter_file, read_yaml
+from t3mpc_ros.parameters.yaml_file import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,
@@ -38,8 +38,8 @@ from t3mpc_ros.radio.tool.calibration_wizard import (
     WizardOptions,
     available_steps,
 )
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 from t3mpc_ros.radio.tool.procedure import ProcedureError
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings
 from t3mpc_ros.robot.calibration import (
     MARKS,
     Calibration,

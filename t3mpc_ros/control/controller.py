@@ -22,12 +22,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from t3mpc_ros.control.actuation import (
-    LimitParameters,
-    ReachMonitor,
-    VelocityActuation,
-    wheel_limits,
-)
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
 from t3mpc_ros.control.control_law import (
     MAX_SMOOTHING,
@@ -47,6 +41,12 @@ from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.odometry_repair import OdometryTwist, StampFilter
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
+from t3mpc_ros.control.velocity_command import (
+    LimitParameters,
+    ReachMonitor,
+    VelocityActuation,
+    wheel_limits,
+)
 from t3mpc_ros.control.watchdog import (
     DriveMonitor,
     InputWatchdog,

@@ -22,7 +22,7 @@ import ctypes
 
 from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
 from t3mpc_ros.emulator.firmware_library import Board
-from t3mpc_ros.emulator.radio_channel import RadioChannel, RadioParameters
+from t3mpc_ros.emulator.nrf24_radio import RadioChannel, RadioParameters
 from t3mpc_ros.radio.protocol.frames import PAYLOAD_LIMIT
 
 SEND_US = 140.0  # delay from the decision to send to the start of the exchange

@@ -23,8 +23,8 @@ import string
 from t3mpc_ros.emulator.dongle import Dongle
 from t3mpc_ros.emulator.event_queue import MICROSECOND
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
+from t3mpc_ros.emulator.nrf24_radio import Medium, RadioChannel, RadioParameters
 from t3mpc_ros.emulator.plant import Plant
-from t3mpc_ros.emulator.radio_channel import Medium, RadioChannel, RadioParameters
 from t3mpc_ros.emulator.robot_board import RadioSettings, RobotBoard
 from t3mpc_ros.emulator.serial_line import SerialLine
 from t3mpc_ros.geometry.types import NANOSECONDS

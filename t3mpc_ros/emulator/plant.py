@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, WheelSpeeds
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import GRAVITY
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance

@@ -14,8 +14,8 @@
 """Drivers of the closed loop, and methods: plain data that makes a driver for each run.
 
 A method that answers accelerations sits between the state estimate and the limits of
-:mod:`t3mpc_ros.control.actuation`, which are the same for all methods; the controller of the node
-has its own.
+:mod:`t3mpc_ros.control.velocity_command`, which are the same for all methods; the controller of
+the node has its own.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,10 +26,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.control.actuation import VelocityActuation
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.velocity_command import VelocityActuation
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,

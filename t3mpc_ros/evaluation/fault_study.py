@@ -44,7 +44,8 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, whee
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds, wrap_angle
 from t3mpc_ros.parameters.table import Value
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultParameters, active_faults
+from t3mpc_ros.simulation.fault_injection import FaultParameters, active_faults
+from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 BEGIN = 10.0
 """Begin of every fault, s."""

@@ -55,7 +55,8 @@ _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'model_file.py',
     'evaluation/bag_report/', 'evaluation/process_replay/', 'evaluation/comparison',
     'evaluation/fault_page.py', 'evaluation/html_page.py', 'evaluation/plotting.py',
-    'evaluation/reporting.py', 'evaluation/result_file.py', 'evaluation/paper/',
+    'evaluation/report_table.py', 'evaluation/reporting.py', 'evaluation/result_file.py',
+    'evaluation/paper/',
     'evaluation/patrol/patrol_page.py', 'evaluation/patrol/tracking_page.py',
 )  # fmt: skip
 

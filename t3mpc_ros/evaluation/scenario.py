@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
-from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
+from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, LinkFaults, cases_for
 from t3mpc_ros.evaluation.record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_of
@@ -34,7 +34,7 @@ from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, find_names
 from t3mpc_ros.simulation import plant_adapter
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
+from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule, load_schedule
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
 from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 

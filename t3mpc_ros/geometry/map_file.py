@@ -20,7 +20,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters import yaml_checks
+from t3mpc_ros.parameters import yaml_file
 
 MAX_CELLS = 25_000_000
 """Largest number of cells of a grid."""
@@ -72,20 +72,20 @@ def load_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     """
     file = Path(path)
     names = 'image', 'resolution', 'origin', 'negate', 'occupied_thresh', 'free_thresh'
-    with yaml_checks.file_errors(file, MapError):
-        read = yaml_checks.check_entry(yaml_checks.read_yaml(file), 'the map', names, ('mode',))
+    with yaml_file.file_errors(file, MapError):
+        read = yaml_file.check_entry(yaml_file.read_yaml(file), 'the map', names, ('mode',))
         if read.get('mode', 'trinary') not in ('trinary', 'scale'):
-            raise yaml_checks.EntryError(f'mode must be trinary or scale: got {read["mode"]}')
-        resolution = yaml_checks.check_number(read['resolution'], 'resolution', 1e-3, 10.0, 'm')
+            raise yaml_file.EntryError(f'mode must be trinary or scale: got {read["mode"]}')
+        resolution = yaml_file.check_number(read['resolution'], 'resolution', 1e-3, 10.0, 'm')
         x, y, yaw = (
-            yaml_checks.check_number(number, f'origin[{index}]', -1e4, 1e4)
-            for index, number in enumerate(yaml_checks.check_list(read['origin'], 'origin', 3, 3))
+            yaml_file.check_number(number, f'origin[{index}]', -1e4, 1e4)
+            for index, number in enumerate(yaml_file.check_list(read['origin'], 'origin', 3, 3))
         )
-        occupied = yaml_checks.check_number(read['occupied_thresh'], 'occupied_thresh', 0.0, 1.0)
-        free = yaml_checks.check_number(read['free_thresh'], 'free_thresh', 0.0, occupied)
-        negate = yaml_checks.check_number(read['negate'], 'negate', 0, 1) != 0
+        occupied = yaml_file.check_number(read['occupied_thresh'], 'occupied_thresh', 0.0, 1.0)
+        free = yaml_file.check_number(read['free_thresh'], 'free_thresh', 0.0, occupied)
+        negate = yaml_file.check_number(read['negate'], 'negate', 0, 1) != 0
         if not isinstance(read['image'], str):
-            raise yaml_checks.EntryError('image must be the name of a file')
+            raise yaml_file.EntryError('image must be the name of a file')
     image = file.parent / read['image']
     share = _read_pgm(image)[::-1]
     darkness = share if negate else 1.0 - share

@@ -37,12 +37,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.path_timing import (
-    MotionLimits,
-    PathEnd,
-    distance_to_path,
-    lengths_along,
-)
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd
+from t3mpc_ros.geometry.polyline import distance_to_path, lengths_along
 from t3mpc_ros.geometry.types import Array, Pose, wrap_angle
 
 SPACING = 0.005

@@ -33,7 +33,7 @@ the rates possible in the next period are an interval that contains the present 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -41,12 +41,11 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.polyline import PathError, check_points
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
-MAX_COORDINATE = 10_000.0
-"""m"""
 STEP = 0.004
 """Grid of the path parameter u, m."""
 TURN_LENGTH = 0.12
@@ -133,26 +132,6 @@ class PathEnd(NamedTuple):
     """Curvature there, 1/m."""
     moving: bool = False
     """Whether the robot may pass without a stop."""
-
-
-class PathError(ValueError):
-    """A path that cannot be followed; the text contains the point, the bound and the value."""
-
-
-def check_points(points: Array) -> None:
-    """Raise :class:`PathError` unless ``points`` has the shape (n, 2) and is within bounds."""
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise PathError(f'points must have the shape (n, 2): got {points.shape}')
-    if not np.isfinite(points).all():
-        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise PathError(f'points must be finite: point {row} is {points[row].tolist()}')
-    beyond = np.abs(points).max(axis=1, initial=0.0) > MAX_COORDINATE
-    if beyond.any():
-        row = int(np.argmax(beyond))
-        raise PathError(
-            f'coordinates must be at most {MAX_COORDINATE:g} m: '
-            f'point {row} is {points[row].tolist()}'
-        )
 
 
 class PathTiming:
@@ -736,37 +715,3 @@ def sample_curve(
     g = (0.5 - offset) * g0 + (0.5 + offset) * g1
     c = (0.5 - offset) * c0 + (0.5 + offset) * c1
     return place_at[0], place_at[1], place_at[2], g * speed, c * speed
-
-
-def polyline_length(points: Array) -> float:
-    """Return the length (m) of a polyline, shape (n, 2)."""
-    return float(np.hypot(*np.diff(points, axis=0).T).sum())
-
-
-def lengths_along(points: Array) -> Array:
-    """Return the length (m) of a polyline, shape (n, 2), up to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-
-
-def resample(points: Array, spacing: float, rounding: Callable[[float], int] = math.ceil) -> Array:
-    """Return evenly spaced points along a polyline, shape (n, 2), with both ends.
-
-    Their distance is ``spacing`` (m) at most, or about that with ``rounding`` :func:`round`.
-    """
-    lengths = lengths_along(points)
-    count = max(1, rounding(float(lengths[-1]) / spacing))
-    along = np.linspace(0.0, lengths[-1], count + 1)
-    return np.column_stack([np.interp(along, lengths, column) for column in points.T])
-
-
-def distance_to_path(points: Array, path: Array) -> Array:
-    """Return the distance (m) of each point, shape (n, 2), to the nearest one of a polyline."""
-    starts, runs = path[:-1], np.diff(path, axis=0)
-    squares = np.maximum((runs**2).sum(axis=1), 1e-18)
-    nearest = np.empty(len(points))
-    for first in range(0, len(points), 256):
-        away = points[first : first + 256, None, :] - starts[None]
-        share = np.clip((away * runs).sum(axis=2) / squares, 0.0, 1.0)
-        gap = away - share[:, :, None] * runs
-        nearest[first : first + 256] = np.sqrt((gap**2).sum(axis=2).min(axis=1))
-    return nearest

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.obstacles import OCCUPIED_PERCENT, OccupancyGrid
-from t3mpc_ros.geometry.path_timing import resample
+from t3mpc_ros.geometry.polyline import resample
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 

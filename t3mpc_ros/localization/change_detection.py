@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, Pose, has_moved
 from t3mpc_ros.kernels import TypedKernel, kernel
-from t3mpc_ros.localization.occupancy_map import DistanceField, distance_at, trace_ray
+from t3mpc_ros.localization.distance_field import DistanceField, distance_at, trace_ray
 from t3mpc_ros.localization.range_model import Beams, RangeModel, hit_likelihood, other_likelihood
 from t3mpc_ros.parameters.table import Parameters, parameter
 

@@ -37,7 +37,7 @@ from t3mpc_ros.geometry.types import (
     wrap_angle,
 )
 from t3mpc_ros.localization.change_detection import ChangeDetector, ChangeParameters
-from t3mpc_ros.localization.occupancy_map import LocalizationMap, map_of_grid
+from t3mpc_ros.localization.distance_field import LocalizationMap, map_of_grid
 from t3mpc_ros.localization.particle_filter import (
     KNOWN_SHARE,
     ParticleFilter,

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.types import Array, Pose, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
-from t3mpc_ros.localization.occupancy_map import DistanceField
+from t3mpc_ros.localization.distance_field import DistanceField
 from t3mpc_ros.localization.range_model import NAMES, Beams, RangeModel, best_logarithm, weigh
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 

@@ -34,7 +34,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.localization.occupancy_map import DistanceField, distance_at, trace_ray
+from t3mpc_ros.localization.distance_field import DistanceField, distance_at, trace_ray
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 NAMES = 'nav2_amcl'

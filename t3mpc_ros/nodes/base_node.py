@@ -40,7 +40,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool
 
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, nearest_hint
 
 P = TypeVar('P', bound=Parameters)
@@ -75,7 +75,7 @@ _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_over
 
 
 def _with_info(
-    callback: Callable[[Any, dict[str, Any]], None], sequence: qos.PublicationSequence
+    callback: Callable[[Any, dict[str, Any]], None], sequence: topic_endpoints.PublicationSequence
 ) -> Callable[..., None]:
     """Return a callback that gets a message and its information, whichever executor calls it.
 
@@ -115,12 +115,16 @@ class MatchingSubscription:
         raw: bool = False,
     ) -> None:
         self._node = node
-        self.sequence = qos.PublicationSequence()
-        called = _with_info(callback, self.sequence) if callback else qos.unused_callback
+        self.sequence = topic_endpoints.PublicationSequence()
+        called = (
+            _with_info(callback, self.sequence) if callback else topic_endpoints.unused_callback
+        )
         self._arguments = message, topic, called
-        self._group = None if callback else qos.PolledCallbackGroup()
+        self._group = None if callback else topic_endpoints.PolledCallbackGroup()
         self._raw = raw
-        self._overridden = qos.overriding_options(node, topic, 'subscription') is not None
+        self._overridden = (
+            topic_endpoints.overriding_options(node, topic, 'subscription') is not None
+        )
         self.subscription: Subscription = self._subscribe(profile)
         """The present subscription."""
 
@@ -136,10 +140,10 @@ class MatchingSubscription:
         present = self.subscription
         name = present.topic_name
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        if qos.compatible_with_all(present.qos_profile, offers):
+        if topic_endpoints.compatible_with_all(present.qos_profile, offers):
             return
         profile = copy(present.qos_profile)
-        profile.reliability = qos.adapt_request_to_offers(offers).reliability
+        profile.reliability = topic_endpoints.adapt_request_to_offers(offers).reliability
         if profile.reliability == present.qos_profile.reliability:
             return  # the mismatch is another one, which the diagnostics name
         self._node.destroy_subscription(present)
@@ -152,7 +156,7 @@ class MatchingSubscription:
         The executor takes one message of a subscription per cycle: a queue that has filled while
         it was busy would otherwise stay full, and every message would wait as long.
         """
-        taken = qos.take_with_info(self.subscription)
+        taken = topic_endpoints.take_with_info(self.subscription)
         for _, info in taken:
             self.sequence.add(info['publication_sequence_number'])
         return [message for message, _ in taken]
@@ -196,7 +200,9 @@ class BaseNode(Node, Generic[P]):
         self.parameters: P = self._declare_parameters(options.get('cli_args') or ())
         self.add_on_set_parameters_callback(self._validate)
         self.add_post_set_parameters_callback(self._apply)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, '/diagnostics', topic_endpoints.DIAGNOSTICS
+        )
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics)
@@ -250,7 +256,7 @@ class BaseNode(Node, Generic[P]):
     def subscriptions(self) -> Iterator[Subscription]:
         """The subscriptions that an executor waits for."""
         for each in super().subscriptions:
-            if not isinstance(each.callback_group, qos.PolledCallbackGroup):
+            if not isinstance(each.callback_group, topic_endpoints.PolledCallbackGroup):
                 yield each
 
     def create_matching_subscription(
@@ -299,10 +305,14 @@ class BaseNode(Node, Generic[P]):
         self.create_service(kind, name, answer)
 
     def _with_overrides(
-        self, topic: str, kind: qos.Kind, args: tuple[Any, ...], options: dict[str, Any]
+        self,
+        topic: str,
+        kind: topic_endpoints.Kind,
+        args: tuple[Any, ...],
+        options: dict[str, Any],
     ) -> tuple[Any, ...]:
         """Return the positional arguments, with a copy of the profile that rclpy may change."""
-        overriding = qos.overriding_options(self, topic, kind)
+        overriding = topic_endpoints.overriding_options(self, topic, kind)
         if overriding is None or 'qos_overriding_options' in options:
             return args
         options['qos_overriding_options'] = overriding
@@ -421,15 +431,17 @@ class BaseNode(Node, Generic[P]):
     def _graph_warnings(self) -> list[str]:
         """Return what prevents this node and the others from working together."""
         if self._unused_overrides is None:  # all endpoints exist by now
-            self._unused_overrides = qos.unused_overrides(self)
+            self._unused_overrides = topic_endpoints.unused_overrides(self)
             for name in self._unused_overrides:
                 self.get_logger().warning(f'{name} has no effect: this node has no such endpoint')
         found = [
             *self.start_warnings,
             *self._publishers_problems(),
             *self.warnings(),
-            qos.qos_problem(self, (each.subscription for each in self._matching), 'subscription'),
-            qos.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
+            topic_endpoints.qos_problem(
+                self, (each.subscription for each in self._matching), 'subscription'
+            ),
+            topic_endpoints.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]
         if self.get_clock().ros_time_is_active and not self.clock_started():
             found.append(f'use_sim_time is set: {NO_CLOCK}')
@@ -444,7 +456,9 @@ class BaseNode(Node, Generic[P]):
         used = {each.topic_name for each in (*self.subscriptions, *self.publishers)}
         for topic in map(self.resolve_topic_name, self.single_publisher_topics):
             if topic in used or topic in several:
-                yield qos.publishers_problem(self, topic, alive=several.get(topic, False))
+                yield topic_endpoints.publishers_problem(
+                    self, topic, alive=several.get(topic, False)
+                )
 
     def _public_publishers(self) -> Iterator[Publisher]:
         """Return the publishers of topics that other nodes use."""

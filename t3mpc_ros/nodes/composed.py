@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from t3mpc_ros.nodes.base_node import BaseNode, accepted_names
-from t3mpc_ros.nodes.qos import RCLError
 from t3mpc_ros.nodes.registry import node_class, parameter_class
+from t3mpc_ros.nodes.topic_endpoints import RCLError
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 

@@ -40,7 +40,7 @@ from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
 from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.model_file import ModelError, find_model, load_model, save_model
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import (
     ADAPT_PERIOD,
     ERROR,
@@ -49,7 +49,7 @@ from t3mpc_ros.nodes.base_node import (
     BaseNode,
     publish_and_wait_for_acked,
 )
-from t3mpc_ros.nodes.conversions import FrameParameters, age_problem, message_age_ns
+from t3mpc_ros.nodes.ros_messages import FrameParameters, age_problem, message_age_ns
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
@@ -106,9 +106,9 @@ class InitialInputs:
     def __init__(self, node: BaseNode[ControllerNodeParameters], name: str) -> None:
         self._node = node
         self._publisher = node.create_publisher(
-            Odometry, f'~/initial_inputs/{name}', qos.INITIAL_INPUTS
+            Odometry, f'~/initial_inputs/{name}', topic_endpoints.INITIAL_INPUTS
         )
-        self._remaining = qos.INITIAL_INPUTS.depth
+        self._remaining = topic_endpoints.INITIAL_INPUTS.depth
         self._end_ns: int | None = None
 
     def republish(self, message: bytes) -> None:
@@ -140,10 +140,12 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         )
         self._controller.warm_up()  # compile and pre-train here, not within a step
         self._journal = Journal()
-        self._journal_publisher = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
+        self._journal_publisher = self.create_publisher(
+            Int64MultiArray, '~/journal', topic_endpoints.JOURNAL
+        )
         self._journal_message = Int64MultiArray(data=self._journal.row)
         self._revision_publisher = self.create_publisher(
-            String, '~/parameters', qos.PARAMETER_REVISIONS
+            String, '~/parameters', topic_endpoints.PARAMETER_REVISIONS
         )
         self._publish_parameters()
         self._load_model()
@@ -160,9 +162,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._logged_reason = self._controller.status.reason
         self._stops = StopHistory()
         self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
-        self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
+        self._command_publisher = self.create_publisher(
+            self._command_type, 'cmd_vel', topic_endpoints.COMMAND
+        )
         self._scalar_publishers = {
-            name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS)
+            name: self.create_publisher(Float64, f'~/{name}', topic_endpoints.SCALARS)
             for name in (SCALAR_NAMES if self.parameters.terms_rate else ())
         }
         self._frame_id = self.parameters.frames.prefixed(
@@ -171,16 +175,18 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._initial_reference = InitialInputs(self, 'reference')
         self._initial_odometry = InitialInputs(self, 'odom')
         self._references = self.create_matching_subscription(
-            Odometry, 'reference', None, qos.STREAM, raw=True
+            Odometry, 'reference', None, topic_endpoints.STREAM, raw=True
         )
         self._odometry = self.create_matching_subscription(
-            Odometry, 'odom', self._on_odometry, qos.STREAM, raw=True
+            Odometry, 'odom', self._on_odometry, topic_endpoints.STREAM, raw=True
         )
         # Like references, ranges are taken before a step: a wait of the executor costs more than
         # a step, and they come 160 times a second.
         self._ranges = (
             [
-                self.create_matching_subscription(Range, f'range/{name}', None, qos.SCALARS)
+                self.create_matching_subscription(
+                    Range, f'range/{name}', None, topic_endpoints.SCALARS
+                )
                 for name in RANGE_SENSORS
             ]
             if self.parameters.keep_out.enabled
@@ -188,7 +194,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         )
         if self.parameters.keep_out.enabled:
             self._map_publisher = self.create_publisher(
-                OccupancyGridMessage, 'keep_out/map', qos.LATCHED
+                OccupancyGridMessage, 'keep_out/map', topic_endpoints.LATCHED
             )
             self.create_steady_timer(MAP_PERIOD, self._publish_map)
             self.offer(Trigger, '~/save_map', self._save_map)
@@ -230,7 +236,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _take_references(self) -> None:
         for message in self._references.take_waiting():
-            state = conversions.state_from_odometry(message)
+            state = ros_messages.state_from_odometry(message)
             self._journal.count_reference(state.stamp_ns)
             if not self._controller.add_reference(state):
                 self._rejected_references += 1
@@ -239,7 +245,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def _take_ranges(self) -> None:
         for sensor, subscription in enumerate(self._ranges):
             for message in subscription.take_waiting():
-                stamp_ns = conversions.ns_from_time(message.header.stamp) or None
+                stamp_ns = ros_messages.ns_from_time(message.header.stamp) or None
                 if self._controller.add_range(sensor, message.range, stamp_ns):
                     self._publish_journal(self._journal.range(sensor, message.range))
                 else:
@@ -254,9 +260,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return
         self._take_references()
         self._take_ranges()
-        measured = conversions.state_from_odometry(message)
+        measured = ros_messages.state_from_odometry(message)
         if not self._steps:
-            self._odometry_frame = conversions.frame_from_serialized(message)
+            self._odometry_frame = ros_messages.frame_from_serialized(message)
         command, status = self._controller.step(measured)
         if self._controller.odometry_used or self._last_odometry_ns is None:
             self._last_odometry_ns = self.steady_ns()
@@ -283,27 +289,29 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         keep_out = self._controller.keep_out
         if keep_out is not None and self._steps and self._map_publisher.get_subscription_count():
             grid = keep_out.map.occupancy()
-            message = conversions.occupancy_message(grid, self.now_ns(), self._odometry_frame)
+            message = ros_messages.occupancy_message(grid, self.now_ns(), self._odometry_frame)
             self._map_publisher.publish(message)
 
     def _adapt_command_type(self) -> None:
         """Publish the other type if it is the only one that a subscriber expects."""
         other = Twist if self._command_type is TwistStamped else TwistStamped
         topic = self.resolve_topic_name('cmd_vel')
-        expected = qos.command_types(self, topic)
-        if expected != {conversions.type_name(other)}:
+        expected = topic_endpoints.command_types(self, topic)
+        if expected != {ros_messages.type_name(other)}:
             return
         # A participant has one type for a topic: the old publisher goes first.
         self.destroy_publisher(self._command_publisher)
         try:
-            self._command_publisher = self.create_publisher(other, 'cmd_vel', qos.COMMAND)
-        except qos.RCLError:  # this process uses the topic with the old type
             self._command_publisher = self.create_publisher(
-                self._command_type, 'cmd_vel', qos.COMMAND
+                other, 'cmd_vel', topic_endpoints.COMMAND
+            )
+        except topic_endpoints.RCLError:  # this process uses the topic with the old type
+            self._command_publisher = self.create_publisher(
+                self._command_type, 'cmd_vel', topic_endpoints.COMMAND
             )
             return
         self._command_type = other
-        self.get_logger().info(f'the robot expects {conversions.type_name(other)}')
+        self.get_logger().info(f'the robot expects {ros_messages.type_name(other)}')
 
     def _on_watchdog(self) -> None:
         self._take_references()
@@ -333,8 +341,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _command_message(self, command: BodyTwist, stamp_ns: int) -> Twist | TwistStamped:
         if self._command_type is TwistStamped:
-            return conversions.stamped_twist(command, stamp_ns, self._frame_id)
-        return conversions.twist_from_body(command)
+            return ros_messages.stamped_twist(command, stamp_ns, self._frame_id)
+        return ros_messages.twist_from_body(command)
 
     def _log_reason(self, status: Status) -> None:
         self._stops.update(status.reason, self.steady_ns())
@@ -424,7 +432,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:
             return ERROR, stopped, values
-        if problem := qos.command_type_problem(self, self._command_type, publish=True):
+        if problem := topic_endpoints.command_type_problem(self, self._command_type, publish=True):
             return WARN, problem, values
         if waiting:
             return WARN, stopped, values

@@ -42,8 +42,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from std_srvs.srv import SetBool
 import yaml
 
-from t3mpc_ros.nodes import qos
-from t3mpc_ros.nodes.conversions import message_class
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.node_main import isolation, own_context
 from t3mpc_ros.nodes.remote_parameters import (
     parameter_message,
@@ -52,6 +51,7 @@ from t3mpc_ros.nodes.remote_parameters import (
     refusal,
     type_text,
 )
+from t3mpc_ros.nodes.ros_messages import message_class
 
 QUIET = 3.5
 """Time without a change of the graph after which a list of it is as good as complete, s: a lost
@@ -109,7 +109,7 @@ class Graph:
     def _others(self) -> set[str]:
         """Return the full names of the other nodes."""
         names = {
-            qos.full_name(where, name)
+            topic_endpoints.full_name(where, name)
             for name, where in self._node.get_node_names_and_namespaces()
         }
         return names - {self._node.get_fully_qualified_name()}
@@ -191,7 +191,7 @@ class Graph:
         except ImportError as error:
             raise GraphError(f'the type of {name} is not installed: {error}') from None
         waiting: deque[Any] = deque()
-        profile = qos.adapt_request_to_offers([info.qos_profile for info in offers])
+        profile = topic_endpoints.adapt_request_to_offers([info.qos_profile for info in offers])
         subscription = self._node.create_subscription(
             kind, name, lambda message: waiting.append(message), profile
         )
@@ -368,7 +368,7 @@ def _end_text(info: TopicEndpointInfo) -> str:
     profile = info.qos_profile
     policies = (profile.reliability, profile.durability)
     words = ', '.join(each.short_key.replace('_', ' ') for each in policies)
-    return f'{qos.full_name(info.node_namespace, info.node_name)} ({info.topic_type}; {words})'
+    return f'{topic_endpoints.node_of(info)} ({info.topic_type}; {words})'
 
 
 def plain(message: Any) -> Any:

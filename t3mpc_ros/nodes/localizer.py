@@ -29,6 +29,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Array, Pose, State
 from t3mpc_ros.localization.change_detection import Change, ChangeKind
+from t3mpc_ros.localization.distance_field import (
+    LocalizationMap,
+    MapError,
+    load_grid,
+    map_of_grid,
+    map_of_world,
+)
 from t3mpc_ros.localization.localizer import (
     LONGEST_SILENCE,
     Localization,
@@ -38,19 +45,12 @@ from t3mpc_ros.localization.localizer import (
     transformed,
     warm_up,
 )
-from t3mpc_ros.localization.occupancy_map import (
-    LocalizationMap,
-    MapError,
-    load_grid,
-    map_of_grid,
-    map_of_world,
-)
 from t3mpc_ros.localization.range_model import NAMES, Beams, beams_of_scan
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode, MatchingSubscription
-from t3mpc_ros.nodes.conversions import FrameParameters
+from t3mpc_ros.nodes.ros_messages import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import WorldError, load_world
 
@@ -158,16 +158,28 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._odometry_used_ns = self.steady_ns()
         self._map_frame = parameters.frames.prefixed(parameters.global_frame_id, namespace)
         self._odometry_frame = parameters.frames.prefixed(parameters.odom_frame_id, namespace)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
-        self._frame = self.create_publisher(TransformStamped, 'map_to_odom', qos.LATCHED)
-        self._filtered = self.create_publisher(Odometry, 'odometry/filtered', qos.STREAM)
+        self._pose = self.create_publisher(
+            PoseWithCovarianceStamped, 'pose', topic_endpoints.LATCHED
+        )
+        self._frame = self.create_publisher(
+            TransformStamped, 'map_to_odom', topic_endpoints.LATCHED
+        )
+        self._filtered = self.create_publisher(
+            Odometry, 'odometry/filtered', topic_endpoints.STREAM
+        )
         base = parameters.frames.prefixed(parameters.base_frame_id, namespace)
-        self._serialized = conversions.SerializedOdometry(self._map_frame, base)
+        self._serialized = ros_messages.SerializedOdometry(self._map_frame, base)
         self._correction = PoseCorrection()
-        self._cloud = self.create_publisher(PoseArray, 'particlecloud', qos.SCALARS)
-        self._changes = self.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
-        self._markers = self.create_publisher(MarkerArray, 'map_changes/markers', qos.LATCHED)
-        self._suspected = self.create_publisher(PoseArray, 'map_changes/suspected', qos.LATCHED)
+        self._cloud = self.create_publisher(PoseArray, 'particlecloud', topic_endpoints.SCALARS)
+        self._changes = self.create_publisher(
+            DiagnosticArray, 'map_changes', topic_endpoints.LATCHED
+        )
+        self._markers = self.create_publisher(
+            MarkerArray, 'map_changes/markers', topic_endpoints.LATCHED
+        )
+        self._suspected = self.create_publisher(
+            PoseArray, 'map_changes/suspected', topic_endpoints.LATCHED
+        )
         self._shown_suspected = np.empty((0, 2))
         self._broadcaster = None
         if parameters.tf_broadcast and (
@@ -178,11 +190,13 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._ranges: list[MatchingSubscription] = []
         if parameters.scan_topic:
             self._scan = self.create_matching_subscription(
-                LaserScan, parameters.scan_topic, None, qos.SCALARS
+                LaserScan, parameters.scan_topic, None, topic_endpoints.SCALARS
             )
         else:
             self._ranges = [
-                self.create_matching_subscription(Range, f'range/{name}', None, qos.SCALARS)
+                self.create_matching_subscription(
+                    Range, f'range/{name}', None, topic_endpoints.SCALARS
+                )
                 for name in RANGE_SENSORS
             ]
         if parameters.world:
@@ -190,12 +204,17 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         elif parameters.yaml_filename:
             self._use_map(load_grid(parameters.yaml_filename))
         else:
-            self.create_matching_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+            self.create_matching_subscription(
+                OccupancyGrid, 'map', self._on_map, topic_endpoints.LATCHED
+            )
         self._odometry = self.create_matching_subscription(
-            Odometry, 'odom', self._on_odometry, qos.STREAM, raw=True
+            Odometry, 'odom', self._on_odometry, topic_endpoints.STREAM, raw=True
         )
         self.create_matching_subscription(
-            PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.COMMAND
+            PoseWithCovarianceStamped,
+            'initialpose',
+            self._on_initial_pose,
+            topic_endpoints.COMMAND,
         )
         self.create_service(
             Empty, 'reinitialize_global_localization', self._reinitialize_global_localization
@@ -220,7 +239,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
                 problem := self._frame_problem(frame)
             ):
                 raise MapError(problem)
-            grid = conversions.grid_from_occupancy(message)
+            grid = ros_messages.grid_from_occupancy(message)
             self._use_map(map_of_grid(grid.cells, grid.resolution, (grid.x, grid.y, 0.0)))
         except ValueError as error:  # a MapError among them
             self._rejected += 1
@@ -234,7 +253,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
 
     def _on_odometry(self, message: bytes, info: dict[str, Any]) -> None:
         for each in (message, *self._odometry.take_waiting()):
-            state = conversions.state_from_odometry(each)
+            state = ros_messages.state_from_odometry(each)
             if self._localizer is None:
                 self._take_readings()
                 continue
@@ -299,7 +318,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
     def _on_initial_pose(self, message: PoseWithCovarianceStamped, info: dict[str, Any]) -> None:
         pose, turn = message.pose.pose.position, message.pose.pose.orientation
         rotation = turn.x, turn.y, turn.z, turn.w
-        place = Pose(pose.x, pose.y, conversions.yaw_from_quaternion(*rotation))
+        place = Pose(pose.x, pose.y, ros_messages.yaw_from_quaternion(*rotation))
         rows = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
         covariance = rows[np.ix_((0, 1, 5), (0, 1, 5))]
         covariance = 0.5 * (covariance + covariance.T)
@@ -330,13 +349,13 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         result = self._localizer.result
         assert result is not None
         message = PoseWithCovarianceStamped(
-            header=conversions.header(result.stamp_ns, self._map_frame)
+            header=ros_messages.header(result.stamp_ns, self._map_frame)
         )
         message.pose.pose.position.x = result.pose.x
         message.pose.pose.position.y = result.pose.y
-        message.pose.pose.orientation = conversions.quaternion_from_yaw(result.pose.yaw)
-        message.pose.covariance = conversions.planar_covariance(
-            result.covariance.tolist(), conversions.MIN_VARIANCE
+        message.pose.pose.orientation = ros_messages.quaternion_from_yaw(result.pose.yaw)
+        message.pose.covariance = ros_messages.planar_covariance(
+            result.covariance.tolist(), ros_messages.MIN_VARIANCE
         )
         self._serialized.set_pose_covariance(message.pose.covariance)
         self._pose.publish(message)
@@ -344,7 +363,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
     def _publish_transform(self) -> None:
         if self._localizer is None or self._localizer.result is None:
             return
-        message = conversions.transform(
+        message = ros_messages.transform(
             self._odometry_ns + round(self.parameters.transform_tolerance * NANOSECONDS),
             self._localizer.result.odometry_frame,
             self._map_frame,
@@ -362,9 +381,9 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
 
     def _pose_array(self, poses: Array) -> PoseArray:
         """Return poses on the map, shape (n, 3), as a message."""
-        message = PoseArray(header=conversions.header(self._odometry_ns, self._map_frame))
+        message = PoseArray(header=ros_messages.header(self._odometry_ns, self._map_frame))
         for x, y, yaw in poses.tolist():
-            pose = geometry_msgs.msg.Pose(orientation=conversions.quaternion_from_yaw(yaw))
+            pose = geometry_msgs.msg.Pose(orientation=ros_messages.quaternion_from_yaw(yaw))
             pose.position.x, pose.position.y = x, y
             message.poses.append(pose)
         return message
@@ -381,7 +400,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         if changes == self._shown_changes:
             return
         self._shown_changes = changes
-        header = conversions.header(self._odometry_ns, self._map_frame)
+        header = ros_messages.header(self._odometry_ns, self._map_frame)
         self._changes.publish(
             DiagnosticArray(header=header, status=[change_status(each) for each in changes])
         )
@@ -432,7 +451,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
 
 def _stamp_ns(message: Range | LaserScan) -> int | None:
     """Return the stamp of a reading, None of one without."""
-    return conversions.ns_from_time(message.header.stamp) or None
+    return ros_messages.ns_from_time(message.header.stamp) or None
 
 
 def change_status(change: Change) -> DiagnosticStatus:
@@ -460,7 +479,7 @@ def change_status(change: Change) -> DiagnosticStatus:
 def change_marker(change: Change, frame: str) -> Marker:
     """Return a change as a cylinder at its place, stamped as first seen; pale: it is not there."""
     marker = Marker(ns='map_changes', id=change.number, type=Marker.CYLINDER, text=change.text)
-    marker.header = conversions.header(change.first_ns, frame)
+    marker.header = ros_messages.header(change.first_ns, frame)
     marker.pose.position.x, marker.pose.position.y = change.x, change.y
     marker.pose.position.z = 0.5 * MARKER_HEIGHT
     marker.pose.orientation.w = 1.0

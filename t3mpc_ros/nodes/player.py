@@ -29,7 +29,7 @@ from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import read_qos_overrides
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.player_publishers import CLOCK, TopicPublishers
 from t3mpc_ros.nodes.player_terminal import KeyboardHandler, ProgressLine
@@ -172,7 +172,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             self.get_logger().warning('the bags have no topic to play')
         clock = None
         if parameters.publishes_clock:
-            clock = self.create_publisher(Clock, CLOCK, qos.LATEST)
+            clock = self.create_publisher(Clock, CLOCK, topic_endpoints.LATEST)
         timeline = PlaybackTimeline(
             lambda at_ns: ReadAheadQueue(
                 reader.schedule(at_ns, begin_ns, end_ns, parameters.loop),

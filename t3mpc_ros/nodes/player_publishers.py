@@ -32,9 +32,9 @@ from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.player import VELOCITY_TYPES, MergedReader, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import BaseNode
-from t3mpc_ros.nodes.qos import RCLError, node_of
+from t3mpc_ros.nodes.topic_endpoints import RCLError, node_of
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
@@ -96,7 +96,7 @@ class TopicPublishers:
         names = [topic, *reader.recorded_names[topic]]
         overrides = [self._qos_overrides[name] for name in names if name in self._qos_overrides]
         offer = (*overrides, adapt_offer_to_recorded_offers(track.offered_qos_profiles))[0]
-        message = conversions.message_class(track.type_name)
+        message = ros_messages.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 
     def all_subscribed(self) -> bool:
@@ -109,7 +109,7 @@ class TopicPublishers:
         for topic, publisher in self.by_topic.items():
             if (
                 self._allow_commands
-                or conversions.type_name(publisher.msg_type) not in VELOCITY_TYPES
+                or ros_messages.type_name(publisher.msg_type) not in VELOCITY_TYPES
             ):
                 continue
             for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name):

@@ -28,7 +28,7 @@ from rosgraph_msgs.msg import Clock
 
 from t3mpc_ros.bag.player import DueMessage, PlaybackTimeline
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class PlayerThread:
     def _publish(self, due: DueMessage) -> None:
         message = due.message
         if self._clock is not None and (message is None or self._clock_with_messages):
-            self._clock.publish(Clock(clock=conversions.time_from_ns(due.stamp_ns)))
+            self._clock.publish(Clock(clock=ros_messages.time_from_ns(due.stamp_ns)))
         if message is None:
             return
         publisher = self._publishers.get(message.topic)

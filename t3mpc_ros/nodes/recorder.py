@@ -13,7 +13,7 @@
 # limitations under the License.
 """``ros2 run t3mpc_ros recorder``: records topics as serialized messages into an MCAP bag.
 
-A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.raw_subscriptions`),
+A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.recorder_subscriptions`),
 a thread compresses and writes them (:mod:`~t3mpc_ros.bag.writer_thread`).
 """
 
@@ -45,9 +45,9 @@ from t3mpc_ros.bag.writer import BagWriter, FolderError, FolderInUseError
 from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.raw_subscriptions import TopicSubscriptions, topic_information
+from t3mpc_ros.nodes.recorder_subscriptions import TopicSubscriptions, topic_information
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
 from t3mpc_ros.parameters.table import ParameterError
@@ -109,7 +109,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self, lambda name, _: name in NODES, self._on_node_parameters
         )
         self.create_subscription(
-            DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.DIAGNOSTICS
+            DiagnosticArray, '/diagnostics', self._on_diagnostics, topic_endpoints.DIAGNOSTICS
         )
         self.offer(Trigger, '~/split_bagfile', self._split)
         self.offer(Trigger, '~/snapshot', self._snapshot)
@@ -230,7 +230,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         remote.destroy()
         node = remote.node_name
         # The nodes of other robots have the same names in other namespaces.
-        own = remote.name == qos.full_name(self.get_namespace(), node)
+        own = remote.name == topic_endpoints.full_name(self.get_namespace(), node)
         record = node if own else remote.name
         values = {row['name']: str(row['value']) for row in rows}
         files, problem = self._metadata.add_parameters(record, node, values, time.time_ns())

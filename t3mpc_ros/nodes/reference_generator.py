@@ -44,7 +44,7 @@ from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceSample
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_from_frame
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import PathError, check_points
+from t3mpc_ros.geometry.polyline import PathError, check_points
 from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
 from t3mpc_ros.geometry.trajectory import REFERENCE_SAMPLES
 from t3mpc_ros.geometry.types import (
@@ -58,7 +58,7 @@ from t3mpc_ros.geometry.types import (
     difference,
     has_jumped,
 )
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import (
     ACK_TIMEOUT,
     NO_CLOCK,
@@ -67,7 +67,7 @@ from t3mpc_ros.nodes.base_node import (
     BaseNode,
     MatchingSubscription,
 )
-from t3mpc_ros.nodes.conversions import FrameParameters
+from t3mpc_ros.nodes.ros_messages import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 PATH_PERIOD = 0.1
@@ -194,11 +194,15 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._path.header.frame_id = frame
         """Path driven so far, in the frame of the reference."""
         self._may_jump = parameters.frame_id.rpartition('/')[2] in FRAMES_THAT_JUMP
-        self._serialized = conversions.SerializedOdometry(frame, child)
-        self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
-        self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
+        self._serialized = ros_messages.SerializedOdometry(frame, child)
+        self._reference_publisher = self.create_publisher(
+            Odometry, 'reference', topic_endpoints.STREAM
+        )
+        self._path_publisher = self.create_publisher(
+            Path, 'reference/path', topic_endpoints.LATCHED
+        )
         self._signals_publisher = self.create_publisher(
-            Int32MultiArray, 'reference/signals', qos.LATCHED
+            Int32MultiArray, 'reference/signals', topic_endpoints.LATCHED
         )
         self._signals: tuple[int, ...] = ()
         self.offer(Trigger, '~/reseed', self._reseed)
@@ -220,32 +224,40 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         parameters = self.parameters
         # Taken before a sample: the executor need not wake for it.
         self._odometry = self.create_matching_subscription(
-            Odometry, 'odom', None, qos.STREAM, raw=True
+            Odometry, 'odom', None, topic_endpoints.STREAM, raw=True
         )
         if parameters.source == 'topic':
             # A volatile subscription receives from every publisher, but not what a latched one has
             # published before; only a transient-local one does, and only from those.
-            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATEST, raw=True)
-            if qos.overriding_options(self, 'path', 'subscription') is None:
-                MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED, raw=True)
+            self.create_matching_subscription(
+                Path, 'path', self._on_path, topic_endpoints.LATEST, raw=True
+            )
+            if topic_endpoints.overriding_options(self, 'path', 'subscription') is None:
+                MatchingSubscription(
+                    self, Path, 'path', self._on_path, topic_endpoints.LATCHED, raw=True
+                )
             self._path_stamps: deque[int] = deque(maxlen=8)
             self._transforms = self._make_transform_buffer()
         elif parameters.plan.enabled:
             self.create_matching_subscription(
-                OccupancyGrid, 'keep_out/map', self._on_map, qos.LATCHED
+                OccupancyGrid, 'keep_out/map', self._on_map, topic_endpoints.LATCHED
             )
-            self.create_matching_subscription(PoseStamped, 'goal_pose', self._on_goal, qos.COMMAND)
             self.create_matching_subscription(
-                PoseArray, 'map_changes/suspected', self._on_suspected, qos.LATCHED
+                PoseStamped, 'goal_pose', self._on_goal, topic_endpoints.COMMAND
+            )
+            self.create_matching_subscription(
+                PoseArray, 'map_changes/suspected', self._on_suspected, topic_endpoints.LATCHED
             )
             if parameters.plan.charging.min_voltage > 0.0:
                 self.create_matching_subscription(
-                    BatteryState, 'battery_state', self._on_battery, qos.SCALARS
+                    BatteryState, 'battery_state', self._on_battery, topic_endpoints.SCALARS
                 )
             self._transforms = self._make_transform_buffer()
         elif parameters.source == 'twist':
             kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
-            self.create_matching_subscription(kind, 'target_twist', self._on_twist, qos.COMMAND)
+            self.create_matching_subscription(
+                kind, 'target_twist', self._on_twist, topic_endpoints.COMMAND
+            )
 
     @property
     def _planned(self) -> PlannedPath | None:
@@ -255,7 +267,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
     def _take_odometry(self) -> None:
         """Make the source where the robot is, once it has reported that; then wait for it."""
         for message in self._odometry.take_waiting()[-1:]:
-            state = conversions.state_from_odometry(message)
+            state = ros_messages.state_from_odometry(message)
             if not state.is_finite():
                 continue
             if self._source is None:
@@ -305,7 +317,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._path_stamps.append(stamp)
         with self._input('path', PathError, struct.error):
             points = self._own_points(
-                conversions.frame_from_serialized(message), conversions.points_from_path(message)
+                ros_messages.frame_from_serialized(message), ros_messages.points_from_path(message)
             )
             self._ended = ''
             if not isinstance(self._source, GivenPathSource):
@@ -340,7 +352,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if frame.lstrip('/') in ('', own):
             return ORIGIN
         if self._transforms is not None and self._transforms.can_transform(own, frame, Time()):
-            return conversions.pose_from_transform(
+            return ros_messages.pose_from_transform(
                 self._transforms.lookup_transform(own, frame, Time()).transform
             )
         raise PathError(f'its frame is {frame}, and no transform from it to {own} is known')
@@ -348,7 +360,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
     def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
         grid = None
         with self._input('keep_out/map', ValueError):
-            grid = conversions.grid_from_occupancy(message)
+            grid = ros_messages.grid_from_occupancy(message)
         if grid is not None and self._planned is not None:
             self._mapped = True
             self._planned.set_map(grid)
@@ -365,7 +377,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def _on_suspected(self, message: PoseArray, info: dict[str, Any]) -> None:
         with self._input('map_changes/suspected', PathError):
-            points = conversions.points_from_poses(message.poses)
+            points = ros_messages.points_from_poses(message.poses)
             places = self._own_points(message.header.frame_id, points)
             if self._planned is not None:
                 self._planned.look_at(places)
@@ -418,7 +430,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         state = State(stamp_ns, self._pose, twist)
         self._reference_publisher.publish(self._serialized.with_state(state))
         if count is not None and count % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
-            self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
+            self._path.poses.append(ros_messages.pose_stamped(state, self._path.header.frame_id))
             del self._path.poses[: -self.parameters.path_points]
         if self._source is None:
             self._pose = advance_pose(self._pose, twist, 1.0 / self.parameters.rate)

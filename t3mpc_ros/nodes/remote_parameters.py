@@ -27,7 +27,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
-from t3mpc_ros.nodes.qos import full_name
+from t3mpc_ros.nodes.topic_endpoints import full_name
 
 SERVICES = {
     'list_parameters': ListParameters,

@@ -21,8 +21,8 @@ from typing import NamedTuple
 from sensor_msgs.msg import BatteryState, Imu, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
+from t3mpc_ros.nodes import ros_messages
+from t3mpc_ros.nodes.ros_messages import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.description import FrameNames
@@ -113,7 +113,7 @@ def imu_message(parameters: ImuParameters, frame: str) -> Imu:
     the variance of an unknown. The other variances are those of noise and quantisation, without
     bias and scale error.
     """
-    message = Imu(header=conversions.header(0, frame))
+    message = Imu(header=ros_messages.header(0, frame))
     message.orientation_covariance[0] = -1.0
     message.linear_acceleration.z = GRAVITY
     rate = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
@@ -129,7 +129,7 @@ def imu_message(parameters: ImuParameters, frame: str) -> Imu:
 
 def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
     """Write a sample into ``message``."""
-    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.header.stamp = ros_messages.time_from_ns(stamp_ns)
     message.angular_velocity.z = sample.angular
     message.linear_acceleration.x = sample.forward
     message.linear_acceleration.y = sample.sideways
@@ -139,7 +139,7 @@ def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
 def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
     """Return a Range message with the limits of the sensor, without a distance."""
     return Range(
-        header=conversions.header(0, frame),
+        header=ros_messages.header(0, frame),
         radiation_type=Range.INFRARED,
         field_of_view=parameters.field_of_view,
         min_range=parameters.minimum,
@@ -154,7 +154,7 @@ def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool
     REP 117: -inf is closer than the minimum range, inf beyond the maximum range. Without
     ``infinity`` the latter becomes ``max_range``, which some consumers take for free space.
     """
-    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.header.stamp = ros_messages.time_from_ns(stamp_ns)
     message.range = message.max_range if distance == math.inf and not infinity else distance
     return message
 
@@ -175,7 +175,7 @@ def battery_message(parameters: BatteryParameters) -> BatteryState:
 
 def fill_battery(message: BatteryState, reading: BatteryReading, stamp_ns: int) -> BatteryState:
     """Write a reading into ``message``; the current of a discharging battery is negative there."""
-    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.header.stamp = ros_messages.time_from_ns(stamp_ns)
     message.voltage = reading.voltage
     message.current = -reading.current
     message.percentage = reading.charge
@@ -191,7 +191,7 @@ def twist_covariance(geometry: WheelGeometry, variance: float) -> list[float]:
     """
     linear = 0.5 * variance * geometry.wheel_radius**2
     angular = linear / geometry.half_separation**2
-    return conversions.planar_covariance(
+    return ros_messages.planar_covariance(
         (
             (min(linear, UNKNOWN_VARIANCE), 0.0, 0.0),
             (0.0, UNKNOWN_VARIANCE, 0.0),

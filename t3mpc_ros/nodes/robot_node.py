@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.geometry.kinematics import frame_between, wheels_from_twist
 from t3mpc_ros.geometry.types import RANGE_SENSORS, BodyTwist, Pose
-from t3mpc_ros.nodes import conversions, qos, robot_messages
+from t3mpc_ros.nodes import robot_messages, ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import ADAPT_PERIOD, BaseNode, MatchingSubscription
 from t3mpc_ros.nodes.robot_messages import RobotDescription, RobotTopicParameters
 from t3mpc_ros.robot.description import fixed_frames
@@ -96,7 +96,7 @@ class RobotNode(BaseNode[P]):
 
     def _subscribe_to_commands(self) -> MatchingSubscription:
         return self.create_matching_subscription(
-            self._command_type, 'cmd_vel', self._on_command, qos.LATEST
+            self._command_type, 'cmd_vel', self._on_command, topic_endpoints.LATEST
         )
 
     def _adapt_command_type(self) -> None:
@@ -109,7 +109,7 @@ class RobotNode(BaseNode[P]):
             return
         other = _other_type(self._command_type)
         peers = self.get_publishers_info_by_topic(self.resolve_topic_name('cmd_vel'))
-        differs = {peer.topic_type for peer in peers} == {conversions.type_name(other)}
+        differs = {peer.topic_type for peer in peers} == {ros_messages.type_name(other)}
         self._mismatches = self._mismatches + 1 if differs else 0
         if self._mismatches * ADAPT_PERIOD >= TYPE_PATIENCE:
             self._mismatches = 0
@@ -123,24 +123,24 @@ class RobotNode(BaseNode[P]):
         self._command_type = other = _other_type(self._command_type)
         try:
             self._commands = self._subscribe_to_commands()
-        except qos.RCLError:
+        except topic_endpoints.RCLError:
             self._command_type = _other_type(other)
             self._commands = self._subscribe_to_commands()
             return
-        self.get_logger().info(f'cmd_vel is published as {conversions.type_name(other)}')
+        self.get_logger().info(f'cmd_vel is published as {ros_messages.type_name(other)}')
 
     def _on_command(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         """Execute a command unless it is too old; its stamp becomes one in robot time."""
         # First of all: if the process is suspended from here on, the command ages.
         robot_ns = self.robot_ns()
-        age_ns = conversions.message_age_ns(info)
+        age_ns = ros_messages.message_age_ns(info)
         self._received += 1
-        problem = conversions.age_problem(age_ns, self.parameters.limiter.command_timeout)
+        problem = ros_messages.age_problem(age_ns, self.parameters.limiter.command_timeout)
         if problem:
             problem = f'command {problem}'
         else:
             now_ns = self.now_ns()
-            twist, stamp_ns = conversions.twist_and_stamp(message, now_ns)
+            twist, stamp_ns = ros_messages.twist_and_stamp(message, now_ns)
             age_ns = 0 if self.has_simulated_time() else max(age_ns, 0)
             problem = self._apply_command(twist, robot_ns - max(age_ns, now_ns - stamp_ns))
         if problem:
@@ -177,7 +177,7 @@ class RobotNode(BaseNode[P]):
         return {'commands': self._received, 'commands_rejected': self._rejected}
 
     def _command_type_problem(self) -> str:
-        return qos.command_type_problem(self, self._command_type, publish=False)
+        return topic_endpoints.command_type_problem(self, self._command_type, publish=False)
 
     # -- states -----------------------------------------------------------------------------------
 
@@ -186,29 +186,33 @@ class RobotNode(BaseNode[P]):
         self._published = 0
         base = self._frame(parameters.base_frame_id)
         odom = self._frame(parameters.odom_frame_id)
-        self._odom = conversions.SerializedOdometry(odom, base)
-        self._odom_publisher = self.create_publisher(Odometry, 'odom', qos.STREAM)
+        self._odom = ros_messages.SerializedOdometry(odom, base)
+        self._odom_publisher = self.create_publisher(Odometry, 'odom', topic_endpoints.STREAM)
         self._set_covariances()
         if robot.truth_frame:
-            self._truth = conversions.SerializedOdometry(robot.truth_frame, base)
+            self._truth = ros_messages.SerializedOdometry(robot.truth_frame, base)
             self._truth_publisher = self.create_publisher(
-                Odometry, 'ground_truth/odom', qos.STREAM
+                Odometry, 'ground_truth/odom', topic_endpoints.STREAM
             )
-        self._joint_publisher = self.create_publisher(JointState, 'joint_states', qos.SCALARS)
+        self._joint_publisher = self.create_publisher(
+            JointState, 'joint_states', topic_endpoints.SCALARS
+        )
         self._broadcaster = None
         if parameters.enable_odom_tf or robot.publishes_map:
             self._broadcaster = self._make_broadcaster('TransformBroadcaster')
         if robot.sensors is None:
             return
         _, range_sensor, battery = robot.sensors
-        self._imu_publisher = self.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
-        self._battery_publisher = self.create_publisher(BatteryState, 'battery_state', qos.SCALARS)
+        self._imu_publisher = self.create_publisher(Imu, 'imu/data_raw', topic_endpoints.STREAM)
+        self._battery_publisher = self.create_publisher(
+            BatteryState, 'battery_state', topic_endpoints.SCALARS
+        )
         self._battery_message = robot_messages.battery_message(battery)
         self._ranges = []
         for name in RANGE_SENSORS if parameters.range_rate else ():
             frame = self._frame(parameters.frame_names.range_sensor(name))
             message = robot_messages.range_message(range_sensor, frame)
-            publisher = self.create_publisher(Range, f'range/{name}', qos.SCALARS)
+            publisher = self.create_publisher(Range, f'range/{name}', topic_endpoints.SCALARS)
             self._ranges.append((publisher, message))
         if parameters.enable_static_tf:
             self._publish_fixed_frames()
@@ -236,7 +240,7 @@ class RobotNode(BaseNode[P]):
 
     def _publish_motion(self, state: RobotState) -> None:
         self._odom.set_pose_covariance(
-            conversions.planar_covariance(state.covariance, conversions.MIN_VARIANCE)
+            ros_messages.planar_covariance(state.covariance, ros_messages.MIN_VARIANCE)
         )
         if state.status.slipping is not self._slipping:
             self._slipping = state.status.slipping
@@ -249,7 +253,7 @@ class RobotNode(BaseNode[P]):
         if self._is_due(self.parameters.joint_rate):
             names = self.parameters.right_wheel_name, self.parameters.left_wheel_name
             self._joint_publisher.publish(
-                conversions.joint_state(names, state.angles, state.wheels, state.stamp_ns)
+                ros_messages.joint_state(names, state.angles, state.wheels, state.stamp_ns)
             )
 
     def _transforms(self, state: RobotState) -> list[TransformStamped]:
@@ -257,10 +261,10 @@ class RobotNode(BaseNode[P]):
         frame, child = self._odom.frame, self._odom.child
         found = []
         if self.parameters.enable_odom_tf:
-            found.append(conversions.transform(stamp_ns, pose, frame, child))
+            found.append(ros_messages.transform(stamp_ns, pose, frame, child))
         if self._description.publishes_map and state.truth is not None:
             origin = frame_between(state.truth.pose, pose)
-            found.append(conversions.transform(stamp_ns, origin, self._truth.frame, frame))
+            found.append(ros_messages.transform(stamp_ns, origin, self._truth.frame, frame))
         return found
 
     def _publish_sensors(self, state: RobotState) -> None:
@@ -294,7 +298,7 @@ class RobotNode(BaseNode[P]):
         _, range_sensor, _ = self._description.sensors
         self._static_broadcaster.sendTransform(
             [
-                conversions.transform(
+                ros_messages.transform(
                     stamp_ns,
                     Pose(frame.x, frame.y, frame.yaw),
                     self._frame(names.base),

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.robot_messages import (
     FOLLOWING,
@@ -36,7 +36,8 @@ from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, make_robot
-from t3mpc_ros.simulation.fault_injection import ScheduleError, active_faults
+from t3mpc_ros.simulation.fault_injection import active_faults
+from t3mpc_ros.simulation.fault_schedule import ScheduleError
 from t3mpc_ros.simulation.world import WorldError
 
 MIN_TIMER_PERIOD, MAX_TIMER_PERIOD = 0.001, 0.05
@@ -153,7 +154,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
         self._state: RobotState | None = None
         self.connect(robot)
         if parameters.publish_clock:
-            self._clock_publisher = self.create_publisher(Clock, '/clock', qos.LATEST)
+            self._clock_publisher = self.create_publisher(Clock, '/clock', topic_endpoints.LATEST)
         self.offer(Trigger, '~/set_pose', self._set_pose)
         self.offer(Trigger, '~/step', self._step)
         self._timer = self.create_steady_timer(self._timer_period(), self._on_timer)
@@ -225,7 +226,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
 
     def _publish_clock(self) -> None:
         if self._state is not None:
-            stamp = conversions.time_from_ns(self._state.stamp_ns)
+            stamp = ros_messages.time_from_ns(self._state.stamp_ns)
             self._clock_publisher.publish(Clock(clock=stamp))
 
     def _set_pose(self) -> tuple[str, str]:

@@ -50,13 +50,13 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.path_timing import PathError, check_points
+from t3mpc_ros.geometry.polyline import PathError, check_points
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.node_main import own_context
-from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_with_info
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.nodes.topic_endpoints import PolledCallbackGroup, full_name, take_with_info
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
 
@@ -259,7 +259,7 @@ class ViewNode(Node):
 
     def _on_state(self, stream: str, data: bytes, sent_ns: int) -> None:
         try:
-            state: State = conversions.state_from_odometry(data)
+            state: State = ros_messages.state_from_odometry(data)
         except struct.error:  # a truncated message
             return
         seconds = self._seconds(state.stamp_ns)
@@ -278,9 +278,9 @@ class ViewNode(Node):
             return
         try:
             twist = (
-                conversions.twist_from_serialized(message)
+                ros_messages.twist_from_serialized(message)
                 if isinstance(message, bytes)
-                else conversions.body_twist(message.twist)
+                else ros_messages.body_twist(message.twist)
             )
         except struct.error:
             return
@@ -290,7 +290,7 @@ class ViewNode(Node):
     def _on_range(self, number: int, data: bytes, sent_ns: int) -> None:
         del sent_ns
         with suppress(struct.error):
-            distance, reach = conversions.range_from_serialized(data)
+            distance, reach = ros_messages.range_from_serialized(data)
             # Beyond is infinite, or the reach, as REP 117 allows.
             self._ranges[number] = reach if distance > reach else max(distance, 0.0)
             self._sink.set('reach', round(reach, 3))
@@ -298,7 +298,7 @@ class ViewNode(Node):
     def _on_term(self, number: int, data: bytes, sent_ns: int) -> None:
         del sent_ns
         with suppress(struct.error):
-            self._terms[number] = conversions.float_from_serialized(data)
+            self._terms[number] = ros_messages.float_from_serialized(data)
 
     def _on_signals(self, message: Int32MultiArray, sent_ns: int) -> None:
         signals = tuple(message.data)
@@ -498,7 +498,7 @@ class ViewNode(Node):
             )
         message = Path()
         message.header.stamp = self.get_clock().now().to_msg()
-        frames = conversions.FrameParameters()
+        frames = ros_messages.FrameParameters()
         message.header.frame_id = frames.prefixed('odom', self.get_namespace())
         message.poses = [
             PoseStamped(header=message.header, pose=Pose(position=Point(x=float(x), y=float(y))))

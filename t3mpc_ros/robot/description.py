@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Where things are on the robot: faces of the range sensors, fixed frames, and the URDF.
+"""Description of the robot: its fixed frames, and the URDF.
 
 The origin of the base frame is on the floor below the middle of the axle, x forward, y to the
 left (REP 103), so that the pose of the odometry has no height. The description has simple shapes
@@ -22,10 +22,9 @@ import math
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-import numpy as np
-
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
+from t3mpc_ros.geometry.types import RANGE_SENSORS
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 _TYRE_WIDTH = 0.02  # m
@@ -65,47 +64,6 @@ class FixedFrame(NamedTuple):
     y: float  # m, to the left
     z: float  # m above the floor
     yaw: float  # rad
-
-
-def sensor_mounts(parameters: RangeSensorParameters) -> Array:
-    """Return x, y (m) and direction (rad) of each sensor's face in the body frame, shape (8, 3).
-
-    x is forward and y to the left of the middle of the axle; in the order of RANGE_SENSORS.
-    """
-    ahead, aside, offset = parameters.half_length, parameters.half_width, parameters.offset
-    quarter = 0.5 * math.pi
-    return np.array(
-        [
-            [ahead, offset, 0.0],
-            [ahead, -offset, 0.0],
-            [offset, aside, quarter],
-            [-offset, aside, quarter],
-            [-ahead, offset, math.pi],
-            [-ahead, -offset, math.pi],
-            [offset, -aside, -quarter],
-            [-offset, -aside, -quarter],
-        ]
-    )
-
-
-def ray_ends(poses: Array, ranges: Array, mounts: Array) -> Array:
-    """Return where the rays of range sensors end, m, shape (n, k, 2).
-
-    ``poses``: x, y (m), yaw (rad), shape (n, 3). ``ranges`` (m, shape (n, k)): 0 gives the
-    faces of the sensors, and a reach that is not finite NaN. ``mounts``: as
-    :func:`sensor_mounts`.
-    """
-    x, y, yaw = (column[:, None] for column in poses.T)
-    ahead, left, direction = (column[None, :] for column in mounts.T)
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    reach = np.where(np.isfinite(ranges), ranges, math.nan)
-    return np.stack(
-        [
-            x + cosine * ahead - sine * left + reach * np.cos(yaw + direction),
-            y + sine * ahead + cosine * left + reach * np.sin(yaw + direction),
-        ],
-        axis=-1,
-    )
 
 
 def fixed_frames(

@@ -32,14 +32,10 @@ from t3mpc_ros.geometry.types import (
 from t3mpc_ros.parameters.table import ParameterError, at_most, group, parameter
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON, SlipMonitor
-from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
-from t3mpc_ros.simulation.fault_injection import (
-    FaultParameters,
-    FaultSchedule,
-    active_faults,
-    load_schedule,
-)
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
+from t3mpc_ros.simulation.fault_injection import FaultParameters, active_faults
+from t3mpc_ros.simulation.fault_schedule import FaultSchedule, load_schedule
 from t3mpc_ros.simulation.fixed_step_robot import FixedStepRobot
 from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters

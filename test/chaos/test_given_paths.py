@@ -29,7 +29,8 @@ from t3mpc_ros.chaos.pose_reference import (
     WaitParameters,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.path_timing import MotionLimits, PathError, PathTiming, distance_to_path
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.polyline import PathError, distance_to_path
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose
 from t3mpc_ros.parameters.table import ParameterError
 

@@ -31,9 +31,9 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, StoredSettings, settings_file
 from t3mpc_ros.radio.tool.link_test import FAIL, PASS, POOR, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import ProcedureError
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, StoredSettings, settings_file
 
 RUN = 'radio.tool.procedure.run_script'
 EMULATOR, RECOVER = 'emulator.emulator.Emulator', 'bag.recovery.recover_bag'
@@ -81,7 +81,7 @@ def compared(same):
     module = 'evaluation.process_replay.'
     outcome = SimpleNamespace(table=lambda: '', same=same, to_dict=dict)
     return {
-        f'{module}controller_replay.load_inputs': None,
+        f'{module}controller_inputs.load_inputs': None,
         f'{module}controller_replay.replay_controller': None,
         f'{module}replay_comparison.compare': outcome,
     }

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, StoredSettings, settings_file
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, StoredSettings, settings_file
 from t3mpc_ros.robot.calibration import Calibration
 
 pytestmark = pytest.mark.slow
@@ -204,7 +204,7 @@ REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
 OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)
 REPLAY = {
     'model_file.load_model': {'w': np.ones(1)},
-    'evaluation.process_replay.controller_replay.load_inputs': 'inputs',
+    'evaluation.process_replay.controller_inputs.load_inputs': 'inputs',
     'evaluation.process_replay.controller_replay.make_controllers': [],
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
     'evaluation.process_replay.replay_comparison.compare': OUTCOME,
@@ -270,8 +270,8 @@ ROBOT = {
     'radio.tool.key_provisioning.format_key_state': '',
     'radio.tool.robot_info.read_log': 'log',
     'radio.tool.robot_info.format_log': '',
-    'radio.tool.eeprom_records.read_settings': None,
-    'radio.tool.eeprom_records.write_settings': STORED,
+    'radio.tool.robot_settings.read_settings': None,
+    'radio.tool.robot_settings.write_settings': STORED,
     'cli.robot_calibrate.CalibrationWizard': lambda start, **_: SimpleNamespace(
         run=lambda: None, calibration=start
     ),

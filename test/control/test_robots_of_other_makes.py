@@ -33,18 +33,19 @@ import yaml
 from bench import other_robots
 from t3mpc_ros.bag.controller_journal import Event
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
-from t3mpc_ros.control.actuation import (
+from t3mpc_ros.control.controller import Controller, StepperControllerParameters
+from t3mpc_ros.control.jump_transition import CommandLimit
+from t3mpc_ros.control.odometry_monitor import OdometryMonitor
+from t3mpc_ros.control.velocity_command import (
     LEAST_SHORTFALL,
     LimitParameters,
     ReachMonitor,
     limit_command,
     wheel_limits,
 )
-from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.jump_transition import CommandLimit
-from t3mpc_ros.control.odometry_monitor import OdometryMonitor
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs, replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.geometry.kinematics import wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 

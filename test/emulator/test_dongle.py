@@ -17,7 +17,7 @@ import pytest
 
 from t3mpc_ros.emulator.dongle import Dongle
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
-from t3mpc_ros.emulator.radio_channel import Medium, RadioChannel, RadioParameters
+from t3mpc_ros.emulator.nrf24_radio import Medium, RadioChannel, RadioParameters
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import Configure, Configured, Ping, Result, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame

@@ -21,7 +21,7 @@ from support.emulator_bench import MS, START_NS, STEP, Bench, check_followed
 from support.long_tests import few_of
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
-from t3mpc_ros.emulator.radio_channel import Medium, RadioParameters, Transmission
+from t3mpc_ros.emulator.nrf24_radio import Medium, RadioParameters, Transmission
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 

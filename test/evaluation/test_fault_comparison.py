@@ -23,7 +23,7 @@ from bench.fault_comparison import FAULTS, Fault, Job, first_said, run_job
 from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.simulation.fault_injection import FaultEvent
+from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 pytestmark = pytest.mark.compiled
 

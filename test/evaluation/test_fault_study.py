@@ -31,7 +31,8 @@ from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario, noisy_twin,
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
-from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent
+from t3mpc_ros.simulation.fault_injection import FAULTS
+from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 pytestmark = pytest.mark.slow
 

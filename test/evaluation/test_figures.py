@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods_for
 from t3mpc_ros.evaluation.paper import paper_figures
-from t3mpc_ros.evaluation.paper.paper_figures import FigureRuns
+from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.paper_tables import Results
 from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.patrol import patrol_page, tracking_page

@@ -34,28 +34,29 @@ from support.long_tests import few_of
 from support.other_parameters import with_other_value
 from support.robot_bags import write_with_records
 
+from t3mpc_ros.bag.columns import read_columns
 from t3mpc_ros.bag.controller_journal import (
     Event,
     Journal,
     parameters_from_json,
 )
 from t3mpc_ros.bag.errors import BagError
-from t3mpc_ros.bag.reader import open_bag, read_columns
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control import watchdog
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
-from t3mpc_ros.evaluation.process_replay.controller_replay import (
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     SPEEDS,
     ReplayError,
     commands_of,
     load_inputs,
     match,
-    replay_controller,
 )
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     ELSEWHERE,
     Tolerances,

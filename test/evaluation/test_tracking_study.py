@@ -23,7 +23,7 @@ from support.records import record_of
 from bench.path_samplings import FeedbackLinearisation, LinearisationParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import tracking_page
 from t3mpc_ros.evaluation.patrol.pure_pursuit import (
@@ -48,7 +48,7 @@ from t3mpc_ros.evaluation.patrol.tracking_study import (
     tuning_grids,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, wheels_from_twist
-from t3mpc_ros.geometry.path_timing import distance_to_path, resample
+from t3mpc_ros.geometry.polyline import distance_to_path, resample
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
 
 PERIOD = 0.01

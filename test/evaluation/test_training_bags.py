@@ -27,6 +27,7 @@ from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models
+from t3mpc_ros.evaluation.training.cross_validation import mean_and_spread, spread_text
 from t3mpc_ros.evaluation.training.model_fit import (
     explained,
     fit_coefficients,
@@ -35,12 +36,7 @@ from t3mpc_ros.evaluation.training.model_fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.train_models import (
-    fit_bags,
-    mean_and_spread,
-    spread_text,
-    training_data_of,
-)
+from t3mpc_ros.evaluation.training.train_models import fit_bags, training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 from t3mpc_ros.model_file import load_model, read_model
 

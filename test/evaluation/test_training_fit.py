@@ -24,12 +24,13 @@ from support.training_runs import GEOMETRY, TrainingRun
 from t3mpc_ros import model_file
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
+from t3mpc_ros.control.velocity_command import LimitParameters, VelocityActuation
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models
+from t3mpc_ros.evaluation.training.cross_validation import blocks
 from t3mpc_ros.evaluation.training.model_fit import (
     estimate_move_effect,
     explained,
@@ -39,7 +40,7 @@ from t3mpc_ros.evaluation.training.model_fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.train_models import blocks, fit_bags
+from t3mpc_ros.evaluation.training.train_models import fit_bags
 from t3mpc_ros.evaluation.training.training_data import (
     TrainingData,
     TrainingError,

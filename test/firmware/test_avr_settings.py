@@ -36,7 +36,7 @@ from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, decode_settings, encode_settings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, decode_settings, encode_settings
 
 pytestmark = needing(*AVR)
 

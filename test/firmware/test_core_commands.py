@@ -20,7 +20,7 @@ from support import firmware_core as core
 from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, RefusalReason
-from t3mpc_ros.radio.tool import eeprom_records
+from t3mpc_ros.radio.tool import robot_settings
 
 PRESS, RELEASE = 5_200, 50_200  # debounce times of the button and a period of the main loop, us
 
@@ -258,8 +258,8 @@ def test_an_empty_battery_stops_the_robot_until_charged(robot):
 def wired(library):
     """Return a robot whose settings say that its battery is measured."""
     robot = core.Robot(library)
-    settings = eeprom_records.RobotSettings(battery_wired=True)
-    assert robot.store(SETTINGS_RECORD, eeprom_records.encode_settings(settings)) == core.OK
+    settings = robot_settings.RobotSettings(battery_wired=True)
+    assert robot.store(SETTINGS_RECORD, robot_settings.encode_settings(settings)) == core.OK
     robot.hello()
     return robot
 

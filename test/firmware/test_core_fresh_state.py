@@ -31,8 +31,8 @@ from support.missing_tools import find, needs
 
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
-from t3mpc_ros.radio.tool import eeprom_records
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
+from t3mpc_ros.radio.tool import eeprom_records, robot_settings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, SharpCurve
 
 HEADERS = '\n'.join(path.read_text() for path in sorted((core.FIRMWARE / 'core').glob('*.h')))
@@ -230,7 +230,7 @@ def change(robot, what):
     elif isinstance(what, Calibration):
         robot.store(CALIBRATION_RECORD, eeprom_records.encode_calibration(what))
     else:
-        robot.store(SETTINGS_RECORD, eeprom_records.encode_settings(what))
+        robot.store(SETTINGS_RECORD, robot_settings.encode_settings(what))
     robot.run(700_000)
 
 

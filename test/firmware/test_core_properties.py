@@ -21,7 +21,7 @@ from support.firmware_core import ADDRESS, COUNTERS, INFO_SIZE, KEY, OK, Dongle,
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, Configure, Key, Store, Transmit
 from t3mpc_ros.radio.protocol.framing import crc16, encode_frame
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, encode_settings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, encode_settings
 
 
 def damaged(frame):

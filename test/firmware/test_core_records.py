@@ -36,11 +36,10 @@ from t3mpc_ros.radio.tool.eeprom_records import (
     Calibration,
     DividerCorrection,
     Estimate,
-    RobotSettings,
     SharpCurve,
     encode_calibration,
-    encode_settings,
 )
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, encode_settings
 
 OLD_SETTINGS = encode_settings(RobotSettings())
 NEW_SETTINGS = encode_settings(

@@ -19,8 +19,8 @@ import pytest
 from support.firmware_core import FAILED, OK, Robot
 
 from t3mpc_ros.radio.protocol.frames import LOG_RECORD, SETTINGS_MISSING, SETTINGS_RECORD
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, encode_settings
 from t3mpc_ros.radio.tool.robot_info import LogKind, decode_log, format_log
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, encode_settings
 
 LED, BUZZER = 1, 2
 STEP_US = 100_000

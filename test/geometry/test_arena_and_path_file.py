@@ -18,7 +18,7 @@ import pytest
 
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import PathError
+from t3mpc_ros.geometry.polyline import PathError
 from t3mpc_ros.parameters.table import ParameterError
 
 POLYGON = (0.0, 0.0, 3.0, -1.0, 4.0, 1.0, 2.0, 2.5, -0.5, 1.5)

@@ -27,14 +27,8 @@ from t3mpc_ros.geometry.path_smoothing import (
     join_curve,
     local_times,
 )
-from t3mpc_ros.geometry.path_timing import (
-    MotionLimits,
-    PathEnd,
-    distance_to_path,
-    polyline_length,
-    resample,
-    time_path,
-)
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, time_path
+from t3mpc_ros.geometry.polyline import distance_to_path, polyline_length, resample
 from t3mpc_ros.geometry.types import Pose
 
 LIMITS, GEOMETRY = MotionLimits(), WheelGeometry()

@@ -20,13 +20,8 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.path_timing import (
-    MotionLimits,
-    PathError,
-    PathTiming,
-    distance_to_path,
-    time_path,
-)
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming, time_path
+from t3mpc_ros.geometry.polyline import PathError, distance_to_path
 from t3mpc_ros.geometry.types import Pose
 
 GEOMETRY = WheelGeometry()

@@ -21,9 +21,9 @@ from support.long_tests import few_of
 
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
 from t3mpc_ros.localization.change_detection import ChangeDetector, ChangeKind, ChangeParameters
-from t3mpc_ros.localization.occupancy_map import map_of_world
+from t3mpc_ros.localization.distance_field import map_of_world
 from t3mpc_ros.localization.range_model import Beams, RangeModel, RangeModelParameters
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import cast_rays, parse_world
 

@@ -27,6 +27,7 @@ from t3mpc_ros.control.watchdog import ContactMonitor
 from t3mpc_ros.geometry.kinematics import advance_pose
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.localization.change_detection import ChangeKind
+from t3mpc_ros.localization.distance_field import map_of_world
 from t3mpc_ros.localization.localizer import (
     LONGEST_SILENCE,
     SYSTEMATIC,
@@ -36,10 +37,9 @@ from t3mpc_ros.localization.localizer import (
     PoseCorrection,
     pose_in,
 )
-from t3mpc_ros.localization.occupancy_map import map_of_world
 from t3mpc_ros.localization.particle_filter import moved_pose, odometry_motion
 from t3mpc_ros.localization.range_model import Beams
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import cast_rays, parse_world
 

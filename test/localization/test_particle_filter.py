@@ -20,7 +20,7 @@ import pytest
 
 from t3mpc_ros.geometry.kinematics import advance_pose
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
-from t3mpc_ros.localization.occupancy_map import map_of_world
+from t3mpc_ros.localization.distance_field import map_of_world
 from t3mpc_ros.localization.particle_filter import (
     ParticleFilter,
     ParticleFilterParameters,

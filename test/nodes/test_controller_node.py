@@ -37,10 +37,10 @@ from support.ros_graph import (
 from t3mpc_ros.geometry.map_file import load_map
 from t3mpc_ros.model_file import ModelError, load_model
 from t3mpc_ros.nodes import controller as controller_module
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.conversions import grid_from_occupancy, time_from_ns
+from t3mpc_ros.nodes.ros_messages import grid_from_occupancy, time_from_ns
 from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.ros
@@ -323,7 +323,7 @@ def test_initial_inputs_end_and_keep_the_first(limit, value, kept, harness, monk
     """After the time limit, or beyond the depth, no later message replaces the first ones."""
     if limit == 'INITIAL_INPUTS':
         profile = QoSProfile(depth=value, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        monkeypatch.setattr(qos, limit, profile)
+        monkeypatch.setattr(topic_endpoints, limit, profile)
     else:
         monkeypatch.setattr(controller_module, limit, value)
     bench = ControllerHarness(harness)

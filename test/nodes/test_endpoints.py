@@ -22,7 +22,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from support.ros_graph import diagnostic, odometry, reason, twist
 
-from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import WARN, BaseNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.node_main import make_executor
@@ -60,14 +60,16 @@ def test_a_robot_executes_best_effort_commands(harness):
 
 def test_overrides_of_the_user_are_the_qos_of_the_publisher(harness, logged):
     """They were accepted without effect; one without an endpoint is a warning."""
-    offered = qos.STREAM.reliability
+    offered = topic_endpoints.STREAM.reliability
     overrides = [
         ODOM_OVERRIDE.format(kind, 'best_effort') for kind in ('publisher', 'subscription')
     ]
     harness.add(SimRobotNode, [word for each in overrides for word in ('-p', each)])
     (offer,) = harness.probe.get_publishers_info_by_topic('/odom')
     assert offer.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    assert qos.STREAM.reliability == offered, 'the profile of the other endpoints is unchanged'
+    assert topic_endpoints.STREAM.reliability == offered, (
+        'the profile of the other endpoints is unchanged'
+    )
     words = 'qos_overrides./odom.subscription.reliability has no effect'
     harness.spin_until(lambda: logged(words))
 
@@ -131,9 +133,9 @@ def test_each_executor_calls_back_and_leaves_polled_messages(events, harness, mo
     node = BaseNode('listener')
     received = []
     node.create_matching_subscription(
-        Twist, 'called', lambda *arguments: received.append(arguments), qos.STREAM
+        Twist, 'called', lambda *arguments: received.append(arguments), topic_endpoints.STREAM
     )
-    polled = node.create_matching_subscription(Twist, 'polled', None, qos.STREAM)
+    polled = node.create_matching_subscription(Twist, 'polled', None, topic_endpoints.STREAM)
     executor.add_node(node)
     try:
         for topic in ('polled', 'called'):

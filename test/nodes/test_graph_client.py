@@ -22,9 +22,9 @@ from std_srvs.srv import SetBool
 import yaml
 
 from t3mpc_ros.nodes import graph_client
-from t3mpc_ros.nodes.conversions import quaternion_from_yaw
 from t3mpc_ros.nodes.graph_client import Graph, GraphError, message_text, rate_text
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.ros_messages import quaternion_from_yaw
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 

@@ -32,7 +32,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.process_group import installed_file
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.geometry.path_timing import distance_to_path, resample
+from t3mpc_ros.geometry.polyline import distance_to_path, resample
 from t3mpc_ros.model_file import find_model, load_model, read_model
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters

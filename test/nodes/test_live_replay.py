@@ -24,8 +24,8 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording_parameters import RecordingParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
-    load_inputs,
     recompute_scalars,
     replay_controller,
 )

@@ -27,9 +27,9 @@ from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, r
 from visualization_msgs.msg import MarkerArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
+from t3mpc_ros.localization.distance_field import MapError
 from t3mpc_ros.localization.localizer import Localization
-from t3mpc_ros.localization.occupancy_map import MapError
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.localizer import LocalizerNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -120,7 +120,7 @@ def test_readings_that_are_not_used_are_named(harness, scan):
     robot = Robot(harness, scan)
     robot.step(node)
     for _ in range(30):
-        stamp = conversions.time_from_ns(robot.stamp_ns + NANOSECONDS)
+        stamp = ros_messages.time_from_ns(robot.stamp_ns + NANOSECONDS)
         robot.step(node, travel=0.0, header=Header(stamp=stamp))
     assert diagnostic_level(node) == WARN
     assert f'no reading of {scan or "range/*"} is used (it is stamped ' in reason(node)

@@ -35,7 +35,7 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import ERROR
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
@@ -93,7 +93,7 @@ def test_a_command_from_the_future_is_rejected(harness, monkeypatch):
     odom = harness.subscribe(Odometry, 'odom')
     source = CommandSource(harness)
     now_ns, lead_ns = time.time_ns, NANOSECONDS
-    monkeypatch.setattr(conversions.time, 'time_ns', lambda: now_ns() - lead_ns)
+    monkeypatch.setattr(ros_messages.time, 'time_ns', lambda: now_ns() - lead_ns)
     source.message = twist(0.3)
     harness.spin_until(lambda: diagnostic(robot, 'commands_rejected') > 20)
     assert max(map(speed, odom)) < 1e-3

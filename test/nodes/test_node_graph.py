@@ -45,14 +45,14 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.registry import NODES, node_class
+from t3mpc_ros.nodes.ros_messages import FrameParameters
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 # -- diagnostics ----------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
         harness.next_status(node.get_name())
     assert not odom
     harness.publish_periodically(
-        clock, lambda: Clock(clock=conversions.time_from_ns(now_ns())), 0.01
+        clock, lambda: Clock(clock=ros_messages.time_from_ns(now_ns())), 0.01
     )
     harness.spin_until(lambda: reason(controller) == 'tracking')
     harness.spin_until(lambda: speed(odom[-1]) > 0.02)
@@ -317,7 +317,7 @@ def test_the_map_frame_puts_the_robot_at_its_true_pose(harness, monkeypatch):
     for odom, origin in sent:
         assert [odom.header.frame_id, odom.child_frame_id] == ['one/odom', 'one/base_link']
         assert [origin.header.frame_id, origin.child_frame_id] == ['map', 'one/odom']
-        true = by_stamp.get(conversions.ns_from_time(odom.header.stamp))
+        true = by_stamp.get(ros_messages.ns_from_time(odom.header.stamp))
         if true is None:
             continue
         checked += 1
@@ -347,8 +347,10 @@ def test_no_living_publisher_is_said_to_be_dead(names, words):
     """Two living controllers were reported for 20 s as one that had ended without notice."""
     infos = [SimpleNamespace(node_name=name, node_namespace='/') for name in names]
     node = SimpleNamespace(get_publishers_info_by_topic=lambda topic: infos)
-    assert qos.publishers_problem(node, '/odom', alive=True) == (words and f'/odom {words}')
-    doubtful = qos.publishers_problem(node, '/odom', alive=False)
+    assert topic_endpoints.publishers_problem(node, '/odom', alive=True) == (
+        words and f'/odom {words}'
+    )
+    doubtful = topic_endpoints.publishers_problem(node, '/odom', alive=False)
     assert doubtful.startswith(words and f'/odom {words}')
     assert ('was killed leaves this list within 20 s' in doubtful) == bool(words)
 
@@ -365,7 +367,7 @@ def test_no_living_publisher_is_said_to_be_dead(names, words):
     ],
 )
 def test_sequence_numbers_tell_whether_two_publish(numbers, several):
-    sequence = qos.PublicationSequence()
+    sequence = topic_endpoints.PublicationSequence()
     for number in numbers:
         sequence.add(number)
     assert sequence.has_several_publishers() is several

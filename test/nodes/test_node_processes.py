@@ -30,7 +30,8 @@ from support.waiting import Processes, wait_until
 from t3mpc_ros.bag.controller_journal import Event
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.cli.process_group import PrivateGraph
-from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs, replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances, compare
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -42,7 +42,7 @@ from t3mpc_ros.bag.player import MergedReader
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.player import PlayerNode
 from t3mpc_ros.nodes.player_terminal import parse_keys
@@ -63,7 +63,7 @@ def write(folder, messages, profiles=None, **more):
     with BagWriter(folder, metadata_records={}, **more) as bag:
         for topic, seconds, message in messages:
             offered = (profiles or {}).get(topic, QosProfile())
-            bag.add_topic(topic, conversions.type_name(type(message)), [offered])
+            bag.add_topic(topic, ros_messages.type_name(type(message)), [offered])
             stamp_ns = START + round(seconds * SECOND)
             bag.write(topic, stamp_ns, stamp_ns, serialize_message(message))
     return str(folder)
@@ -170,7 +170,7 @@ def test_the_time_of_the_bag_is_published_as_clock(harness, logged, tmp_path):
     assert harness.probe.get_publishers_info_by_topic('/clock')
     harness.spin_until(lambda: player.exit_requested)
     harness.spin_until(lambda: len(text) == 50)
-    stamps = [conversions.ns_from_time(message.clock) for message in clock]
+    stamps = [ros_messages.ns_from_time(message.clock) for message in clock]
     assert stamps == sorted(stamps)
     assert stamps[0] >= START
     assert stamps[-1] <= START + 0.98 * SECOND

@@ -39,8 +39,8 @@ from t3mpc_ros.bag.writer import BagWriter, DiskError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.raw_subscriptions import FULL_DISCOVERY, TopicSubscriptions
 from t3mpc_ros.nodes.recorder import TAKE_PERIOD
+from t3mpc_ros.nodes.recorder_subscriptions import FULL_DISCOVERY, TopicSubscriptions
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros

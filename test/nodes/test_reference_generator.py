@@ -31,8 +31,8 @@ from t3mpc_ros.chaos.path_replanning import NOWHERE_TIME
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import cause_of
 from t3mpc_ros.geometry.obstacles import OccupancyGrid as Cells
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.conversions import occupancy_message
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
+from t3mpc_ros.nodes.ros_messages import occupancy_message
 
 pytestmark = pytest.mark.ros
 

@@ -33,7 +33,7 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import ERROR, WARN
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
@@ -192,7 +192,7 @@ def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
 
     def say(stamp_ns):
         message = TwistStamped(twist=twist(0.3))
-        message.header.stamp = conversions.time_from_ns(stamp_ns)
+        message.header.stamp = ros_messages.time_from_ns(stamp_ns)
         commands.publish(message)
 
     say(robot.now_ns() - 2 * NANOSECONDS)

@@ -38,7 +38,7 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.robot_messages import count_variance, imu_message, twist_covariance
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
@@ -239,7 +239,7 @@ def test_the_initial_pose_is_true_unless_within_a_wall(harness):
     )
 
     def pose(messages):
-        return conversions.state_from_odometry(serialize_message(messages[-1])).pose
+        return ros_messages.state_from_odometry(serialize_message(messages[-1])).pose
 
     harness.spin_until(lambda: truth)
     assert pose(truth) == pytest.approx((-1.0, 0.2, 1.0), abs=1e-3)
@@ -295,7 +295,7 @@ def test_paused_time_advances_by_steps_only(harness):
     assert not response.success
     assert 'real_time_factor must be 0' in response.message
     assert change(harness, robot, real_time_factor=0.0)[0].successful
-    held = conversions.time_from_ns(states[-1].stamp_ns)
+    held = ros_messages.time_from_ns(states[-1].stamp_ns)
     harness.spin_until(lambda: clock[-1].clock == held, 'the held time is published')
     count = len(clock)
     harness.spin_until(lambda: len(clock) > count + 5)

@@ -27,7 +27,7 @@ from std_msgs.msg import Header, Int32MultiArray
 from support.page_data import read_all
 from support.ros_graph import CommandSource, twist
 
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
 from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
@@ -122,8 +122,10 @@ def test_a_moving_robot_is_shown(viewer, harness):
 
 def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
     """It was marked when its message arrived: as much too early as the reference is sent ahead."""
-    reference = harness.probe.create_publisher(Odometry, 'reference', qos.STREAM)
-    signals = harness.probe.create_publisher(Int32MultiArray, 'reference/signals', qos.LATCHED)
+    reference = harness.probe.create_publisher(Odometry, 'reference', topic_endpoints.STREAM)
+    signals = harness.probe.create_publisher(
+        Int32MultiArray, 'reference/signals', topic_endpoints.LATCHED
+    )
     sent, switches = [], []
 
     def send(mode, *, switch):
@@ -131,7 +133,7 @@ def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
         if switch:
             signals.publish(Int32MultiArray(data=[mode, 1, 2]))
             switches.append(now + LEAD_NS)
-        stamp = conversions.time_from_ns(now + LEAD_NS)
+        stamp = ros_messages.time_from_ns(now + LEAD_NS)
         reference.publish(Odometry(header=Header(stamp=stamp)))
         sent.append(now + LEAD_NS)
 
@@ -150,7 +152,9 @@ def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
 
 
 def test_what_contradicts_the_map_is_shown_once(viewer, harness):
-    publisher = harness.probe.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
+    publisher = harness.probe.create_publisher(
+        DiagnosticArray, 'map_changes', topic_endpoints.LATCHED
+    )
     numbers = {'x_m': '0.5', 'y_m': '-0.25', 'size_m': '0.3'}
 
     def send(kind, present):
@@ -188,7 +192,7 @@ def test_a_command_without_stamp_has_the_time_of_its_sending(viewer):
 
 
 def odometry(stamp_ns):
-    return serialize_message(Odometry(header=Header(stamp=conversions.time_from_ns(stamp_ns))))
+    return serialize_message(Odometry(header=Header(stamp=ros_messages.time_from_ns(stamp_ns))))
 
 
 def test_the_e_stop_latches_and_is_shown(viewer, robot):
@@ -232,7 +236,9 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
 
 def test_a_drawn_path_reaches_the_reference_and_no_later_one(viewer, harness):
     paths = []
-    listen = partial(harness.probe.create_subscription, Path, 'path', paths.append, qos.LATCHED)
+    listen = partial(
+        harness.probe.create_subscription, Path, 'path', paths.append, topic_endpoints.LATCHED
+    )
     with pytest.raises(CommandFailedError, match='no node follows a path: start reference_gen'):
         viewer.command('path', points=[[1.0, 2.0]])
     first = listen()
@@ -341,7 +347,9 @@ def test_robots_of_other_namespaces_are_left_alone(robot, harness):
     assert other._state.status.estop
     assert not robot._state.status.estop
     # A goal that is given meanwhile: the robot would start at the release, without a word.
-    harness.probe.create_subscription(Path, '/east/path', lambda path: None, qos.LATCHED)
+    harness.probe.create_subscription(
+        Path, '/east/path', lambda path: None, topic_endpoints.LATCHED
+    )
     viewer.spin_until(lambda: viewer.node._path_publisher.get_subscription_count())
     text = viewer.command('path', points=[[1.0, 2.0]])
     assert text.endswith('the robot drives there as soon as the emergency stop is released')

@@ -33,10 +33,11 @@ from t3mpc_ros.radio.tool.bench_checklist import (
     check_board,
     check_builds,
 )
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, Stored
+from t3mpc_ros.radio.tool.eeprom_records import Stored
 from t3mpc_ros.radio.tool.link_test import FAIL, PASS, POOR, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection
 
 PONG = Pong(1, b'ping', 0, 2, 2, 0, 1, 0, 0, 0, 1, 0, 82, b'T3MPC', 7)

@@ -27,7 +27,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
 from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
-from t3mpc_ros.radio.tool import eeprom_records
+from t3mpc_ros.radio.tool import eeprom_records, robot_settings
 from t3mpc_ros.radio.tool.procedure import Procedure
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
@@ -80,13 +80,13 @@ def test_records_of_the_specification_byte_for_byte():
     golden = dict(VECTORS['records']['settings'])
     body = bytes.fromhex(golden.pop('bytes'))
     golden |= {'address': bytes.fromhex(golden['address']), 'sensors': tuple(golden['sensors'])}
-    settings = eeprom_records.RobotSettings(**golden)
-    assert eeprom_records.encode_settings(settings) == body
-    assert eeprom_records.decode_settings(body) == settings
+    settings = robot_settings.RobotSettings(**golden)
+    assert robot_settings.encode_settings(settings) == body
+    assert robot_settings.decode_settings(body) == settings
     wired = settings._replace(battery_wired=True)  # from firmware 2.1
     body = body[:13] + bytes([body[13] | 4]) + body[14:]
-    assert eeprom_records.encode_settings(wired) == body
-    assert eeprom_records.decode_settings(body) == wired
+    assert robot_settings.encode_settings(wired) == body
+    assert robot_settings.decode_settings(body) == wired
     golden = VECTORS['records']['calibration']
     body = bytes.fromhex(golden['bytes'])
     names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'
@@ -158,11 +158,11 @@ def test_calibration_survives_reset_and_lost_frames(library, loss):
     # A value is changed with the others kept.
     changed = stored._replace(gyro_bias=None)
     assert cable.run(eeprom_records.write_calibration(changed)) == changed
-    settings = eeprom_records.RobotSettings(channel=100, sensors=8 * ('none',))
-    body = eeprom_records.encode_settings(settings)
+    settings = robot_settings.RobotSettings(channel=100, sensors=8 * ('none',))
+    body = robot_settings.encode_settings(settings)
     assert cable.run(eeprom_records.write_record(frames.SETTINGS_RECORD, body)) == body
     record = cable.run(eeprom_records.read_record(frames.SETTINGS_RECORD))
-    assert (record.valid, eeprom_records.decode_settings(record.content)) == (True, settings)
+    assert (record.valid, robot_settings.decode_settings(record.content)) == (True, settings)
 
 
 def test_damage_and_bad_timing_have_a_remedy(library):

@@ -18,7 +18,7 @@ from pathlib import Path
 import yaml
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
-from t3mpc_ros.emulator.radio_channel import RadioParameters
+from t3mpc_ros.emulator.nrf24_radio import RadioParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 
 ROOT = Path(__file__).resolve().parents[2]

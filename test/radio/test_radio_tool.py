@@ -23,7 +23,7 @@ from support.long_tests import few_of
 from support.tool_bench import START_NS, ToolBench
 import yaml
 
-from t3mpc_ros.parameters.yaml_checks import YamlError
+from t3mpc_ros.parameters.yaml_file import YamlError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -32,16 +32,17 @@ from t3mpc_ros.radio.protocol.frames import CommandFlag, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
     channel_scan,
-    eeprom_records,
     key_provisioning,
     link_test,
     manoeuvre,
     robot_info,
+    robot_settings,
 )
 from t3mpc_ros.radio.tool.channel_scan import ChannelResult
-from t3mpc_ros.radio.tool.eeprom_records import SENSORS, RobotSettings
+from t3mpc_ros.radio.tool.eeprom_records import SENSORS
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, format_log
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200
@@ -114,8 +115,8 @@ def test_key_and_settings_are_never_sent_to_the_dongle():
         feed(data, now_ns)
 
     bench.emulator.feed = record
-    writing = eeprom_records.write_settings(RobotSettings())
-    for script in (key_provisioning.write_key(KEY), eeprom_records.read_settings(), writing):
+    writing = robot_settings.write_settings(RobotSettings())
+    for script in (key_provisioning.write_key(KEY), robot_settings.read_settings(), writing):
         with pytest.raises(ProcedureError, match='this is the dongle'):
             bench.at_dongle(script, ROBOT_BOARD)
     assert received
@@ -150,17 +151,17 @@ def test_a_silent_port_fails_with_a_remedy():
 
 
 def write(bench, seed=1, **changes):
-    stored = bench.at_robot(eeprom_records.read_settings())
+    stored = bench.at_robot(robot_settings.read_settings())
     entropy = random.Random(seed).randbytes
-    wanted = eeprom_records.change_settings(stored, changes, entropy)
-    written = bench.at_robot(eeprom_records.write_settings(wanted))
+    wanted = robot_settings.change_settings(stored, changes, entropy)
+    written = bench.at_robot(robot_settings.write_settings(wanted))
     assert written == (frames.SETTINGS_GOOD, wanted)
     return wanted
 
 
 def host_of(settings):
     """Return link parameters from the parameter file of a robot."""
-    content = yaml.safe_load(eeprom_records.settings_file(settings))
+    content = yaml.safe_load(robot_settings.settings_file(settings))
     # A node rejects what it does not know: settings of the board once ended radio_bridge.
     assert set(content['/**']['ros__parameters']) == {'link'}
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
@@ -171,20 +172,20 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
     addresses = set()
     for seed in range(20):
         bench = ToolBench(erased=True)
-        assert bench.at_robot(eeprom_records.read_settings()).state == frames.SETTINGS_MISSING
+        assert bench.at_robot(robot_settings.read_settings()).state == frames.SETTINGS_MISSING
         settings = write(bench, seed)
         assert settings[1:] == RobotSettings()[1:]
         addresses.add(settings.address)
         changed = write(bench, seed + 100, channel=100, microsteps=8)
         assert changed == settings._replace(channel=100, microsteps=8)
-        assert bench.at_robot(eeprom_records.read_settings()).content == changed
+        assert bench.at_robot(robot_settings.read_settings()).content == changed
     assert len(addresses) == 20
 
 
 def test_drawn_addresses_are_receivable_and_no_numbers():
     source = random.Random(1)
     for _ in range(2000):
-        text = eeprom_records.draw_address(source.randbytes).hex()
+        text = robot_settings.draw_address(source.randbytes).hex()
         assert not {'00', '55', 'aa', 'ff'} & {text[at : at + 2] for at in range(0, 10, 2)}
         assert isinstance(yaml.safe_load(text), str)
         with pytest.raises(ValueError):
@@ -195,7 +196,7 @@ def test_a_settings_file_holds_every_setting():
     source = random.Random(4)
     for _ in range(50):
         settings = RobotSettings(
-            eeprom_records.draw_address(source.randbytes),
+            robot_settings.draw_address(source.randbytes),
             source.randint(0, 125),
             source.choice(frames.RATES),
             source.choice(frames.POWERS),
@@ -207,11 +208,11 @@ def test_a_settings_file_holds_every_setting():
             source.random() < 0.5,
             tuple(source.choices(SENSORS, k=8)),
         )
-        text = eeprom_records.settings_file(settings)
-        assert eeprom_records.settings_of_file(yaml.safe_load(text)) == settings
+        text = robot_settings.settings_file(settings)
+        assert robot_settings.settings_of_file(yaml.safe_load(text)) == settings
         assert host_of(settings).rate == settings.rate
         other = settings._replace(divider=settings.divider + 1, channel=settings.channel + 1)
-        rows = eeprom_records.differences(settings, other).splitlines()
+        rows = robot_settings.differences(settings, other).splitlines()
         assert [row.partition(':')[0] for row in rows] == ['channel', 'divider']
 
 
@@ -229,10 +230,10 @@ def test_a_settings_file_holds_every_setting():
     ],
 )
 def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
-    text = eeprom_records.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
+    text = robot_settings.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
     assert old in text
     with pytest.raises(YamlError, match=words):
-        eeprom_records.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
+        robot_settings.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
 
 
 # -- ping -----------------------------------------------------------------------------------------
@@ -389,7 +390,7 @@ def test_each_entry_of_the_log_in_words():
         (LogKind.IMU, 0): 'the inertial sensor does not answer',
         (LogKind.RADIO, 0): 'the radio chip does not answer',
         (LogKind.BATTERY, 8970): 'battery below its cut-off: 9.0 V',
-        (LogKind.RECORDS, 3): eeprom_records.SETTINGS_TEXTS[3],
+        (LogKind.RECORDS, 3): robot_settings.SETTINGS_TEXTS[3],
         (LogKind.RECORDS, 99): 'records in state 99',
         (LogKind.LOOP, 12345): 'longest pass of the main loop: 12.3 ms',
         (99, 7): 'unknown entry 99: 7',
@@ -570,4 +571,4 @@ def test_settings_survive_a_restart_of_the_robot():
     bench = ToolBench(erased=True)
     settings = write(bench)
     bench.emulator.restart_robot()
-    assert bench.at_robot(eeprom_records.read_settings()).content == settings
+    assert bench.at_robot(robot_settings.read_settings()).content == settings

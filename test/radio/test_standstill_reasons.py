@@ -30,7 +30,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool import eeprom_records
+from t3mpc_ros.radio.tool import robot_settings
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 
 KEY = bytes(range(16))
@@ -210,7 +210,7 @@ def the_robot_has_forgotten_the_session(bench):
 
 @cause('measures no battery voltage, but its settings say that the battery is wired')
 def the_wire_of_the_battery_breaks(bench):
-    settings = eeprom_records.encode_settings(eeprom_records.RobotSettings(battery_wired=True))
+    settings = robot_settings.encode_settings(robot_settings.RobotSettings(battery_wired=True))
     body = settings + crc16(settings).to_bytes(2, 'little')
     for copy in (40, 72):
         bench.board.write_eeprom(copy, body)

@@ -21,7 +21,8 @@ import pytest
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
-from t3mpc_ros.robot.description import FrameNames, Masses, fixed_frames, sensor_mounts, urdf
+from t3mpc_ros.robot.description import FrameNames, Masses, fixed_frames, urdf
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 NAMES = FrameNames('base', 'gyro', 'sharp_', 'right_hinge_joint', 'left_hinge_joint')

@@ -26,14 +26,12 @@ import pytest
 import setuptools
 from support.properties import PROPERTY
 
-from t3mpc_ros.simulation.fault_injection import (
-    FAULTS,
+from t3mpc_ros.simulation.fault_injection import FAULTS, FaultParameters, active_faults
+from t3mpc_ros.simulation.fault_schedule import (
     SCHEDULES_FOLDER,
     FaultEvent,
-    FaultParameters,
     FaultSchedule,
     ScheduleError,
-    active_faults,
     load_schedule,
 )
 from t3mpc_ros.simulation.world import WORLDS_FOLDER

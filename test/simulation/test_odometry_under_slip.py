@@ -26,7 +26,7 @@ from support.checkout import ROOT, load_example
 from support.long_tests import few_of
 
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
-from t3mpc_ros.simulation.fault_injection import FaultEvent
+from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 pytestmark = [pytest.mark.slow, pytest.mark.compiled]
 

@@ -36,7 +36,7 @@ from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import Command
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
 from t3mpc_ros.simulation.world import cast_rays, load_world
 

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 from t3mpc_ros.radio.protocol import codec
 from t3mpc_ros.radio.protocol.frames import Command, Hello, Poll, Result, State, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, encode_settings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, encode_settings
 
 FIRMWARE = Path(__file__).parents[2] / 'firmware'
 BUILD = FIRMWARE / 'build'

@@ -29,7 +29,7 @@ from t3mpc_ros.radio.protocol.authentication import siphash
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, Command, RefusalReason
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16, encode_frame
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, encode_settings
+from t3mpc_ros.radio.tool.robot_settings import RobotSettings, encode_settings
 
 FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
 KEY = bytes(range(0x80, 0x90))

@@ -28,7 +28,8 @@ import numpy as np
 
 from t3mpc_ros.bag.controller_journal import Journal
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_replay import CONTROLLER, FIELDS, output_row
+from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
+from t3mpc_ros.evaluation.process_replay.controller_replay import output_row
 from t3mpc_ros.evaluation.process_replay.replay_writer import (
     LATER,
     controller_bag,
@@ -46,7 +47,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist,
 from t3mpc_ros.model_file import load_model
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation.digital_twin import DigitalTwin
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
+from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule
 
 GOLDEN = Path(__file__).resolve().parents[1] / 'golden'
 

@@ -27,7 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from support.waiting import wait_until
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import OK
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.node_main import make_executor
@@ -278,14 +278,14 @@ def twist(linear=0.0, angular=0.0):
 
 def odometry(stamp_ns, linear=0.0, angular=0.0):
     message = Odometry()
-    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.header.stamp = ros_messages.time_from_ns(stamp_ns)
     message.pose.pose.orientation.w = 1.0
     message.twist.twist = twist(linear, angular)
     return message
 
 
 def stamp(message):
-    return conversions.ns_from_time(message.header.stamp)
+    return ros_messages.ns_from_time(message.header.stamp)
 
 
 def speed(message):

@@ -27,7 +27,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.api import comparison_runs, result_tables
 from t3mpc_ros.evaluation.api.error_messages import one_sentence, sentence
-from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
@@ -42,13 +42,14 @@ from t3mpc_ros.evaluation.experiment import (
     run_experiment,
 )
 from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric, measure
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
+from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError
-from t3mpc_ros.simulation.fault_injection import FaultSchedule
+from t3mpc_ros.simulation.fault_schedule import FaultSchedule
 
 ROBOT = 'robot.'
 """Prefix of a parameter of the true robot."""

@@ -27,7 +27,8 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
-from t3mpc_ros.evaluation.reporting import Table, write_columns
+from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.parameters.command_line import check_writable
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.script_error import ScriptError

@@ -36,8 +36,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
+from t3mpc_ros.evaluation.api.noise_law import NoiseLaw, gaussian_noise
 from t3mpc_ros.evaluation.api.own_reference import sampled
-from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace, gaussian_noise
+from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
@@ -52,7 +53,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.parameters.table import Parameters, find_names
 from t3mpc_ros.script_error import ScriptError
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
+from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule, load_schedule
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'

@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH, ReportError, Repo
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
 from t3mpc_ros.parameters.command_line import parsed_value
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.description import ray_ends, sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, recorded_world
 

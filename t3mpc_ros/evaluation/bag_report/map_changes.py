@@ -21,7 +21,7 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.evaluation.html_page import Block, Heading, Paragraph
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.report_table import Table
 from t3mpc_ros.geometry.types import Array
 
 TOPIC = 'map_changes'

@@ -22,8 +22,8 @@ import numpy as np
 
 from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
+from t3mpc_ros.evaluation.bag_report.link_metrics import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms

@@ -24,7 +24,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.continuity import gaps, pose_jumps
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED
+from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,

@@ -24,7 +24,7 @@ from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.message_losses import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report import incidents
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,
@@ -52,7 +52,8 @@ from t3mpc_ros.evaluation.html_page import (
     html_page,
 )
 from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from, spans_of
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_number
+from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,

@@ -52,7 +52,8 @@ from t3mpc_ros.evaluation.html_page import (
     VerdictBox,
     html_page,
 )
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_number
+from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     REFERENCE,

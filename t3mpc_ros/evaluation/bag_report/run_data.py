@@ -21,16 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.errors import DataError
-from t3mpc_ros.bag.reader import (
-    CDR_LAYOUTS,
-    BagReader,
-    TopicColumns,
-    missing_sample_ratio,
-    read_columns,
-)
+from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report import diagnostic_history
+from t3mpc_ros.evaluation.bag_report import diagnostic_history, link_metrics
 from t3mpc_ros.evaluation.bag_report.continuity import (
     MIN_JUMPS,
     MIXED_SHARE,
@@ -177,7 +172,7 @@ class Run:
     """From diagnostics: first time, level, node, text."""
     changes: tuple[diagnostic_history.DiagnosticEvent, ...]
     """Likewise, each time that a node got worse."""
-    links: tuple[diagnostic_history.LinkHistory, ...]
+    links: tuple[link_metrics.LinkHistory, ...]
     oddities: tuple[str, ...]
     """Sentences on what is unusual in the bag, and what was done about it."""
     remarks: tuple[str, ...]

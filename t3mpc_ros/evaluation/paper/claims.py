@@ -34,7 +34,8 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS
 from t3mpc_ros.evaluation.paper import study
-from t3mpc_ros.evaluation.reporting import Table, format_number
+from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
 from t3mpc_ros.geometry.types import Array
 

@@ -21,7 +21,8 @@ from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval,
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, STAGES, WITHOUT
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of, finite
+from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import columns_of, finite
 from t3mpc_ros.evaluation.result_file import Row
 
 SITUATION = ('drive', 'noise', 'case')

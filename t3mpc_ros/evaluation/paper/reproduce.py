@@ -20,10 +20,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation import html_page, open_loop_estimation, reporting
+from t3mpc_ros.evaluation import html_page, open_loop_estimation, report_table, reporting
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
-from t3mpc_ros.evaluation.paper import paper_figures, study
+from t3mpc_ros.evaluation.paper import figure_runs, paper_figures, study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
 from t3mpc_ros.evaluation.plotting import write_pictures
@@ -59,7 +59,7 @@ def reproduce(
     extent = study.chosen_extent(quick=quick, seeds=seeds)
     results = Results(run_study(extent, output, workers, fresh=fresh, report=report))
     write('  runs for the figures')
-    showcase = paper_figures.simulate_figure_runs(extent, results, workers)
+    showcase = figure_runs.simulate_figure_runs(extent, results, workers)
     write('  estimation without a controller (86)')
     alone = estimation_seeds or tuple(range(1, 3 if quick else 21))
     variances = (0.0, 0.04) if quick else open_loop_estimation.VARIANCES
@@ -152,9 +152,9 @@ class ExhibitData:
     """What exhibits are made of."""
 
     results: Results
-    showcase: paper_figures.FigureRuns
+    showcase: figure_runs.FigureRuns
     claims: Sequence[Claim]
-    tables: Mapping[str, Sequence[reporting.Table]]
+    tables: Mapping[str, Sequence[report_table.Table]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,8 +372,10 @@ def counted(claims: Sequence[Claim]) -> str:
 
 def _claims(title: str, claims: Sequence[Claim], origin: str) -> html_page.Details:
     chosen = [claim for claim in claims if claim.origin == origin]
-    rows = [(claim.text, claim.found, reporting.verdict_mark(claim.verdict)) for claim in chosen]
-    table = reporting.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
+    rows = [
+        (claim.text, claim.found, report_table.verdict_mark(claim.verdict)) for claim in chosen
+    ]
+    table = report_table.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
     return html_page.Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
@@ -381,8 +383,9 @@ def _exhibit(
     exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]
 ) -> html_page.Group:
     claims = exhibit.decided_by(material.claims)
-    found: list[Sequence[str | reporting.Mark]] = [
-        (f'{claim.text}: {claim.found}', reporting.verdict_mark(claim.verdict)) for claim in claims
+    found: list[Sequence[str | report_table.Mark]] = [
+        (f'{claim.text}: {claim.found}', report_table.verdict_mark(claim.verdict))
+        for claim in claims
     ]
     if not found:
         found = [(exhibit.finding(material) if exhibit.finding else exhibit.caption,)]
@@ -391,7 +394,7 @@ def _exhibit(
         html_page.Items(found, 'side', 'Found here'),
     ]
     blocks: list[html_page.Block] = [
-        html_page.Heading(exhibit.title, reporting.verdict_mark(exhibit.mark(material.claims))),
+        html_page.Heading(exhibit.title, report_table.verdict_mark(exhibit.mark(material.claims))),
         html_page.Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):

@@ -26,7 +26,7 @@ import numpy as np
 
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem
-from t3mpc_ros.geometry.path_timing import polyline_length
+from t3mpc_ros.geometry.polyline import polyline_length
 from t3mpc_ros.geometry.types import Array
 
 LEG = 1.0

@@ -48,7 +48,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.parameters.table import find_names
-from t3mpc_ros.robot.description import ray_ends, sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
 

@@ -53,15 +53,15 @@ from t3mpc_ros.geometry.types import (
     State,
     wrap_angle,
 )
+from t3mpc_ros.localization.distance_field import map_of_world
 from t3mpc_ros.localization.localizer import (
     Localization,
     Localizer,
     LocalizerParameters,
     PoseCorrection,
 )
-from t3mpc_ros.localization.occupancy_map import map_of_world
-from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant_adapter import Signals

@@ -29,10 +29,10 @@ from typing import Protocol
 
 import numpy as np
 
-from t3mpc_ros.control.actuation import LimitParameters, limit_command, wheel_limits
+from t3mpc_ros.control.velocity_command import LimitParameters, limit_command, wheel_limits
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
-from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample
+from t3mpc_ros.geometry.polyline import check_points, polyline_length, resample
 from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, WheelSpeeds, wrap_angle
 
 SPACING = 0.002

@@ -32,10 +32,10 @@ from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.record import RATE, Record, spans_of
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array, State
-from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.world import MovingDisc, World, cast_rays, clearance, parse_world

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol import patrol_run
@@ -43,7 +43,8 @@ from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import distance_to_path, polyline_length, resample, time_path
+from t3mpc_ros.geometry.path_timing import time_path
+from t3mpc_ros.geometry.polyline import distance_to_path, polyline_length, resample
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.parameters.table import find_names
 

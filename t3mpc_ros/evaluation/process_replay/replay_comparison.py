@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.plotting import COLOURS
-from t3mpc_ros.evaluation.process_replay.controller_replay import (
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     ControllerInputs,
     ReplayError,
-    ReplayResult,
 )
+from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
 from t3mpc_ros.geometry.types import Array
 
 Flags = NDArray[np.bool_]

@@ -23,13 +23,13 @@ import numpy as np
 from t3mpc_ros.bag.controller_journal import parameters_to_json
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_replay import (
+from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     SPEEDS,
     ControllerInputs,
-    ReplayResult,
     motions,
 )
+from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, State
 from t3mpc_ros.parameters.table import Value

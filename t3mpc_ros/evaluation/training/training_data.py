@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.evaluation.process_replay import controller_replay
+from t3mpc_ros.evaluation.process_replay import controller_inputs, controller_replay
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist
 
@@ -74,9 +74,9 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
     TrainingError: topics or parameters are missing, or contradict the recorded commands.
     """
     try:
-        inputs = controller_replay.load_inputs(folder)
+        inputs = controller_inputs.load_inputs(folder)
         controllers = controller_replay.make_controllers(inputs)
-    except controller_replay.ReplayError as error:
+    except controller_inputs.ReplayError as error:
         raise TrainingError(str(error)) from error
     revisions = [each for session in inputs.sessions for each in session.parameters.values()]
     parameters = revisions[-1].resolved()
@@ -105,13 +105,13 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
 
 
 def _replayed(
-    inputs: controller_replay.ControllerInputs,
+    inputs: controller_inputs.ControllerInputs,
     controllers: list[Controller],
     parameters: ControllerParameters,
 ) -> TrainingData:
     """Return inputs and decisions of the controller at each step, by a replay of its journal."""
     recorded = np.stack(
-        [inputs.recorded[name] for name in controller_replay.SPEEDS], axis=1
+        [inputs.recorded[name] for name in controller_inputs.SPEEDS], axis=1
     ).tolist()
     exact = inputs.exact
     patience = parameters.watchdog.odometry_timeout * NANOSECONDS

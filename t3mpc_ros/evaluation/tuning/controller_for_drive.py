@@ -17,7 +17,7 @@ from dataclasses import asdict
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.tuning.drive_identification import IdentifiedDrive
-from t3mpc_ros.parameters.yaml_checks import parameter_file
+from t3mpc_ros.parameters.yaml_file import parameter_file
 
 
 def fitting_parameters(

@@ -23,10 +23,10 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, Pong, Samples
 from t3mpc_ros.radio.tool import eeprom_records
-from t3mpc_ros.radio.tool.eeprom_records import SETTINGS_TEXTS, StoredSettings, read_settings
 from t3mpc_ros.radio.tool.link_test import FAIL, PASS, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import Pause, Script, wait_for_board
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, read_log
+from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS, StoredSettings, read_settings
 from t3mpc_ros.robot.calibration import (
     CONVERTER_COUNTS,
     MAX_GYRO_BIAS,

@@ -31,7 +31,7 @@ import numpy as np
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool import eeprom_records, procedure
+from t3mpc_ros.radio.tool import eeprom_records, procedure, robot_settings
 from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.robot import calibration
@@ -113,9 +113,9 @@ class CalibrationRobot:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""
         return self._at_board(eeprom_records.read_counts(samples))
 
-    def settings(self) -> eeprom_records.RobotSettings:
+    def settings(self) -> robot_settings.RobotSettings:
         """Return the settings of the robot."""
-        stored = self._at_board(eeprom_records.read_settings())
+        stored = self._at_board(robot_settings.read_settings())
         if not stored.valid:
             raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
         return stored.content

@@ -25,7 +25,8 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_uplink, encode
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool import procedure
-from t3mpc_ros.radio.tool.eeprom_records import SETTINGS_TEXTS, request_part
+from t3mpc_ros.radio.tool.eeprom_records import request_part
+from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
 
 _REPLY_TIMEOUT = 0.25  # s
 _MAX_ATTEMPTS = 20

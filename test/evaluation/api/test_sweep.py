@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation import run_key
 from t3mpc_ros.evaluation.api import parameter_sweep
 from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
 from t3mpc_ros.evaluation.cases import LinkFaults
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
+from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule
 
 SHORT = {'plant': 'servo', 'duration': 2.0}
 GAINS = {'gain': [10.0, 20.0]}

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Actuation of accelerations on a velocity-controlled robot: prediction, command E19, limits.
+"""Velocity command for an acceleration: predicted wheel speeds, command E19, limits.
 
 The plant (64) is chi' = g*(chi) + u + omega. With a torque drive, u is the torque theta_bar u.
 With a velocity drive a first-order servo tracks the commanded wheel speeds c after a dead time,

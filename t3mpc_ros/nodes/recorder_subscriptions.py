@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Raw subscriptions polled by a timer, topic discovery and QoS adaptation of the recorder.
+"""Subscriptions of the recorder: topic discovery, adapted QoS, polled raw messages, and lost ones.
 
 The executor of rclpy builds a wait set with all entities of the node for each message that it
 delivers; at 2000 messages per second this alone takes more than one core. The callback group of
@@ -45,19 +45,19 @@ from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
-from t3mpc_ros.nodes import conversions, qos
-from t3mpc_ros.nodes.qos import PolledCallbackGroup, unused_callback
+from t3mpc_ros.nodes import ros_messages, topic_endpoints
+from t3mpc_ros.nodes.topic_endpoints import PolledCallbackGroup, unused_callback
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
 EXPECTED_TOPICS = {
-    'reference': (_ODOMETRY, qos.RECORDER),
-    'odom': (_ODOMETRY, qos.RECORDER),
-    'ground_truth/odom': (_ODOMETRY, qos.RECORDER),
-    'cmd_vel': ('geometry_msgs/msg/Twist', qos.RECORDER),
-    'controller/journal': ('std_msgs/msg/Int64MultiArray', qos.RECORDER_LATCHED),
-    'controller/initial_inputs/reference': (_ODOMETRY, qos.RECORDER_LATCHED),
-    'controller/initial_inputs/odom': (_ODOMETRY, qos.RECORDER_LATCHED),
+    'reference': (_ODOMETRY, topic_endpoints.RECORDER),
+    'odom': (_ODOMETRY, topic_endpoints.RECORDER),
+    'ground_truth/odom': (_ODOMETRY, topic_endpoints.RECORDER),
+    'cmd_vel': ('geometry_msgs/msg/Twist', topic_endpoints.RECORDER),
+    'controller/journal': ('std_msgs/msg/Int64MultiArray', topic_endpoints.RECORDER_LATCHED),
+    'controller/initial_inputs/reference': (_ODOMETRY, topic_endpoints.RECORDER_LATCHED),
+    'controller/initial_inputs/odom': (_ODOMETRY, topic_endpoints.RECORDER_LATCHED),
 }
 """Types and requests of topics subscribed to before they are published, to record the first
 message. Of transient-local publishers the messages from before discovery, without which a run
@@ -111,7 +111,7 @@ class TopicSubscriptions:
             topic = self._node.resolve_topic_name(name)
             if self._topic_filter.matches(topic, [type_name]):
                 # A node of this process may use another type; discovery finds its publisher.
-                with suppress(qos.RCLError):
+                with suppress(topic_endpoints.RCLError):
                     self._subscribe(topic, type_name, profile)
 
     def discover(self) -> None:
@@ -147,23 +147,23 @@ class TopicSubscriptions:
         type_names = [info.topic_type for info in publishers]
         profiles = [info.qos_profile for info in publishers]
         held = self._subscriptions.get(topic)
-        request = qos.adapt_request_to_offers(profiles)
+        request = topic_endpoints.adapt_request_to_offers(profiles)
         type_name = type_names[0]
         if held and held.type_name in type_names:
             type_name = held.type_name
             # Only a transient-local subscription receives messages from before discovery; after
             # the first recorded message a new one would receive them twice.
-            lacks_history = qos.is_transient_local(request) and not qos.is_transient_local(
-                held.qos
-            )
-            if qos.compatible_with_all(held.qos, profiles) and (
+            lacks_history = topic_endpoints.is_transient_local(
+                request
+            ) and not topic_endpoints.is_transient_local(held.qos)
+            if topic_endpoints.compatible_with_all(held.qos, profiles) and (
                 not lacks_history or held.received
             ):
                 return
         self._record()
         try:
             self._subscribe(topic, type_name, request)
-        except (ImportError, qos.RCLError) as error:
+        except (ImportError, topic_endpoints.RCLError) as error:
             self.exclude(topic, str(error))
 
     def _subscribe(self, topic: str, type_name: str, profile: QoSProfile) -> None:
@@ -171,7 +171,7 @@ class TopicSubscriptions:
 
         Raises ImportError without the message type, RCLError if this process uses another one.
         """
-        message = conversions.message_class(type_name)
+        message = ros_messages.message_class(type_name)
         replaced = self._subscriptions.get(topic)
         self._unsubscribe(topic)
         subscription = self._node.create_subscription(

@@ -27,7 +27,7 @@ from std_msgs.msg import Float64
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
-from t3mpc_ros.nodes import conversions, robot_messages
+from t3mpc_ros.nodes import robot_messages, ros_messages
 from t3mpc_ros.nodes.robot_messages import state_values, state_warnings
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import (
@@ -62,33 +62,33 @@ def message_of(state, frame='', child=''):
     """Return an odometry message, field by field."""
     message = Odometry(child_frame_id=child)
     message.header.frame_id = frame
-    message.header.stamp = conversions.time_from_ns(state.stamp_ns)
+    message.header.stamp = ros_messages.time_from_ns(state.stamp_ns)
     message.pose.pose.position.x, message.pose.pose.position.y = state.pose[:2]
-    message.pose.pose.orientation = conversions.quaternion_from_yaw(state.pose.yaw)
-    message.twist.twist = conversions.twist_from_body(state.twist)
+    message.pose.pose.orientation = ros_messages.quaternion_from_yaw(state.pose.yaw)
+    message.twist.twist = ros_messages.twist_from_body(state.twist)
     return message
 
 
 def from_odometry(message):
-    return conversions.state_from_odometry(serialize_message(message))
+    return ros_messages.state_from_odometry(serialize_message(message))
 
 
 def yaw_of(rotation):
-    return conversions.yaw_from_quaternion(rotation.x, rotation.y, rotation.z, rotation.w)
+    return ros_messages.yaw_from_quaternion(rotation.x, rotation.y, rotation.z, rotation.w)
 
 
 @pytest.mark.parametrize('stamp_ns', STAMPS)
 def test_a_stamp_survives_to_the_nanosecond(stamp_ns):
-    stamp = conversions.time_from_ns(stamp_ns)
+    stamp = ros_messages.time_from_ns(stamp_ns)
     assert 0 <= stamp.nanosec < NANOSECONDS
-    assert conversions.ns_from_time(stamp) == stamp_ns
+    assert ros_messages.ns_from_time(stamp) == stamp_ns
 
 
 @pytest.mark.parametrize('frame', range(9))
 @pytest.mark.parametrize('child', range(9))
 def test_odometry_is_written_and_read_whatever_its_frames(frame, child):
     """Texts of any length precede the numbers, which lie at multiples of eight."""
-    serialized = conversions.SerializedOdometry('a' * frame, 'b' * child)
+    serialized = ros_messages.SerializedOdometry('a' * frame, 'b' * child)
     for motion in motions(3):
         message = message_of(motion, serialized.frame, serialized.child)
         message.pose.covariance[:] = np.arange(36.0) * motion.pose.x
@@ -102,7 +102,7 @@ def test_odometry_is_written_and_read_whatever_its_frames(frame, child):
         assert back._replace(pose=motion.pose) == motion
         assert back.pose == pytest.approx(motion.pose, abs=1e-14)
     with pytest.raises(struct.error):
-        conversions.state_from_odometry(serialize_message(message)[:-350])
+        ros_messages.state_from_odometry(serialize_message(message)[:-350])
 
 
 def path_message(places, frame, frames):
@@ -123,9 +123,9 @@ def test_points_of_a_path_are_read_whatever_its_frames(length, frames):
     for count in (0, 1, 2, 7):
         places = [(0.1 * k, -0.3 * k) for k in range(count)]
         data = serialize_message(path_message(places, 'f' * length, frames))
-        assert conversions.points_from_path(data).tolist() == [list(each) for each in places]
+        assert ros_messages.points_from_path(data).tolist() == [list(each) for each in places]
         with pytest.raises(struct.error):
-            conversions.points_from_path(data[: 60 * count + 10])
+            ros_messages.points_from_path(data[: 60 * count + 10])
 
 
 def test_a_long_path_is_read_at_once_and_not_pose_by_pose(monkeypatch):
@@ -139,9 +139,9 @@ def test_a_long_path_is_read_at_once_and_not_pose_by_pose(monkeypatch):
     data[len(one) - 84 : len(one) - 80] = struct.pack('<I', count)
     read, reads = struct.unpack_from, []
     monkeypatch.setattr(
-        conversions.struct, 'unpack_from', lambda *given: reads.append(given[0]) or read(*given)
+        ros_messages.struct, 'unpack_from', lambda *given: reads.append(given[0]) or read(*given)
     )
-    points = conversions.points_from_path(bytes(data))
+    points = ros_messages.points_from_path(bytes(data))
     assert len(reads) < 10
     assert points.shape == (count, 2)
     assert (points == (1.0, 2.0)).all()
@@ -152,7 +152,7 @@ def test_big_endian_odometry_is_read():
     numbers = struct.pack(
         '>7d36d6d36d', 1, 2, 3, 0, 0, 0, 1, *36 * [9], 4, 0, 0, 0, 0, 5, *36 * [9]
     )
-    state = conversions.state_from_odometry(header + numbers)
+    state = ros_messages.state_from_odometry(header + numbers)
     assert state == State(7 * NANOSECONDS + 8, Pose(1.0, 2.0, 0.0), BodyTwist(4.0, 5.0))
 
 
@@ -164,23 +164,23 @@ def test_ranges_are_read_whatever_their_frame(frame):
     for distance in (0.25, math.inf, -math.inf):
         message.range = distance
         data = serialize_message(message)
-        assert conversions.range_from_serialized(data) == (distance, 1.5)
+        assert ros_messages.range_from_serialized(data) == (distance, 1.5)
         with pytest.raises(struct.error):
-            conversions.range_from_serialized(data[:-9])
+            ros_messages.range_from_serialized(data[:-9])
 
 
 def test_numbers_are_read():
     data = serialize_message(Float64(data=-0.1))
-    assert conversions.float_from_serialized(data) == -0.1
+    assert ros_messages.float_from_serialized(data) == -0.1
     swapped = bytes(4) + data[:3:-1]
-    assert conversions.float_from_serialized(swapped) == -0.1
+    assert ros_messages.float_from_serialized(swapped) == -0.1
     with pytest.raises(struct.error):
-        conversions.float_from_serialized(data[:-1])
+        ros_messages.float_from_serialized(data[:-1])
 
 
 def test_yaw_survives_the_conversion_to_a_quaternion():
     for yaw in YAWS:
-        rotation = conversions.quaternion_from_yaw(yaw)
+        rotation = ros_messages.quaternion_from_yaw(yaw)
         assert (rotation.x, rotation.y) == (0.0, 0.0)
         assert math.hypot(rotation.z, rotation.w) == pytest.approx(1.0, abs=1e-15)
         # q and -q are the same rotation.
@@ -202,7 +202,7 @@ def test_roll_and_pitch_do_not_change_the_yaw():
         yaw = generator.uniform(-math.pi, math.pi)
         pitch, roll = generator.uniform(-1.4, 1.4), generator.uniform(-math.pi, math.pi)
         x, y, z, w = Rotation.from_euler('ZYX', [yaw, pitch, roll]).as_quat()
-        assert conversions.yaw_from_quaternion(x, y, z, w) == pytest.approx(yaw, abs=1e-12)
+        assert ros_messages.yaw_from_quaternion(x, y, z, w) == pytest.approx(yaw, abs=1e-12)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e200])
@@ -240,8 +240,8 @@ def test_non_finite_odometry_stays_non_finite(place, value):
 def test_poses_in_all_their_messages_agree():
     for motion in motions():
         odometry = message_of(motion)
-        posed = conversions.pose_stamped(motion, 'odom')
-        moved = conversions.transform(motion.stamp_ns, motion.pose, 'odom', 'base_link', 0.25)
+        posed = ros_messages.pose_stamped(motion, 'odom')
+        moved = ros_messages.transform(motion.stamp_ns, motion.pose, 'odom', 'base_link', 0.25)
         assert posed.pose == odometry.pose.pose
         assert posed.header.stamp == moved.header.stamp == odometry.header.stamp
         assert (posed.header.frame_id, moved.header.frame_id) == ('odom', 'odom')
@@ -261,7 +261,7 @@ def test_a_planar_covariance_fills_x_y_and_yaw():
         (0.0, planar),
         (1e9, planar - np.diag(np.diag(planar)) + 1e9 * np.eye(3)),
     ):
-        full = np.array(conversions.planar_covariance(planar, least)).reshape(6, 6)
+        full = np.array(ros_messages.planar_covariance(planar, least)).reshape(6, 6)
         np.testing.assert_array_equal(full[np.ix_(known, known)], wanted)
         np.testing.assert_array_equal(full, full.T)
         assert np.linalg.eigvalsh(full).min() > 0.0
@@ -272,31 +272,31 @@ def test_a_planar_covariance_fills_x_y_and_yaw():
 
 def test_a_command_survives_a_twist():
     for motion in motions():
-        assert conversions.body_twist(conversions.twist_from_body(motion.twist)) == motion.twist
-        stamped = conversions.stamped_twist(motion.twist, motion.stamp_ns, 'base_link')
+        assert ros_messages.body_twist(ros_messages.twist_from_body(motion.twist)) == motion.twist
+        stamped = ros_messages.stamped_twist(motion.twist, motion.stamp_ns, 'base_link')
         assert stamped.header.frame_id == 'base_link'
-        assert conversions.twist_and_stamp(stamped, 5) == (motion.twist, motion.stamp_ns)
+        assert ros_messages.twist_and_stamp(stamped, 5) == (motion.twist, motion.stamp_ns)
     # A command without a stamp has the present time.
     for message in (Twist(), TwistStamped()):
-        assert conversions.twist_and_stamp(message, 5) == (BodyTwist(0.0, 0.0), 5)
+        assert ros_messages.twist_and_stamp(message, 5) == (BodyTwist(0.0, 0.0), 5)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize('part', ['linear', 'angular'])
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])
 def test_one_non_finite_number_invalidates_a_command(part, axis, value):
-    message = conversions.twist_from_body(BodyTwist(0.5, 1.0))
+    message = ros_messages.twist_from_body(BodyTwist(0.5, 1.0))
     setattr(getattr(message, part), axis, value)
     for each in (message, TwistStamped(twist=message)):
-        twist, _ = conversions.twist_and_stamp(each, 5)
+        twist, _ = ros_messages.twist_and_stamp(each, 5)
         assert not all(map(math.isfinite, twist))
 
 
 def test_wheel_joints_keep_their_order():
-    message = conversions.joint_state(('right', 'left'), (1.0, 2.0), np.array((3.0, 4.0)), 7)
+    message = ros_messages.joint_state(('right', 'left'), (1.0, 2.0), np.array((3.0, 4.0)), 7)
     assert message.name == ['right', 'left']
     assert (list(message.position), list(message.velocity)) == ([1.0, 2.0], [3.0, 4.0])
-    assert conversions.ns_from_time(message.header.stamp) == 7
+    assert ros_messages.ns_from_time(message.header.stamp) == 7
 
 
 # -- sensors --------------------------------------------------------------------------------------
@@ -320,7 +320,7 @@ def test_imu_covariance_is_the_variance_of_its_samples():
     noisier = robot_messages.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
     assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
     robot_messages.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
-    assert conversions.ns_from_time(message.header.stamp) == 7
+    assert ros_messages.ns_from_time(message.header.stamp) == 7
     assert message.header.frame_id == 'a/imu'
     turn, push = message.angular_velocity, message.linear_acceleration
     assert (turn.x, turn.y, turn.z) == (0.0, 0.0, 0.5)

@@ -15,7 +15,7 @@
 
 import pytest
 
-from t3mpc_ros.parameters.yaml_checks import (
+from t3mpc_ros.parameters.yaml_file import (
     MAX_FILE_SIZE,
     YamlError,
     parse_yaml,

@@ -18,17 +18,17 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.actuation import (
+from t3mpc_ros.control.speed_kalman_filter import (
+    SpeedFilterParameters,
+    SpeedKalmanFilter,
+    stationary_gain,
+)
+from t3mpc_ros.control.velocity_command import (
     LimitParameters,
     VelocityActuation,
     limit_command,
     limit_scale,
     wheel_limits,
-)
-from t3mpc_ros.control.speed_kalman_filter import (
-    SpeedFilterParameters,
-    SpeedKalmanFilter,
-    stationary_gain,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds

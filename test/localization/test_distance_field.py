@@ -21,7 +21,7 @@ import yaml
 
 from t3mpc_ros.geometry.map_file import MapError, load_map, save_map
 from t3mpc_ros.geometry.obstacles import OccupancyGrid
-from t3mpc_ros.localization.occupancy_map import load_grid, map_of_grid, map_of_world, trace_ray
+from t3mpc_ros.localization.distance_field import load_grid, map_of_grid, map_of_world, trace_ray
 from t3mpc_ros.simulation.world import cast_ray, load_world
 
 REACH = 1.0

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What publishers and subscriptions match by: QoS profiles, overrides, types, mismatches."""
+"""Publishers and subscriptions: QoS profiles and overrides, polling, lost messages, mismatches."""
 
 from collections.abc import Iterable, Sequence
 from copy import copy
@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.parameters.table import ParameterError
 
 RCLError: type[Exception] = rclpy_implementation.RCLError
@@ -291,7 +291,7 @@ def command_type_problem(node: Node, message: type, *, publish: bool) -> str:
         if publish
         else node.get_publishers_info_by_topic(name)
     )
-    expected = conversions.type_name(message)
+    expected = ros_messages.type_name(message)
     other = next((peer.topic_type for peer in peers if peer.topic_type != expected), '')
     if not other:
         return ''

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Radio channels between nRF24L01+ transceivers, packet by packet, with data-sheet timing.
+"""Radio of nRF24L01+ transceivers, packet by packet, with data-sheet timing.
 
 Each dongle and its robot have a channel; the medium joins those of several. A packet reaches every
 robot of its frequency, rate and address. Packets that overlap at one frequency are all lost.
