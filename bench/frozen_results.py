@@ -46,10 +46,8 @@ from t3mpc_ros.evaluation.bag_report.run_data import load_run  # noqa: E402
 from t3mpc_ros.evaluation.cases import ROBOTS  # noqa: E402
 from t3mpc_ros.evaluation.experiment import measured_run  # noqa: E402
 from t3mpc_ros.evaluation.methods import methods_for  # noqa: E402
-from t3mpc_ros.evaluation.process_replay.controller_replay import (  # noqa: E402
-    load_inputs,
-    replay_controller,
-)
+from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs  # noqa: E402
+from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller  # noqa: E402
 from t3mpc_ros.evaluation.scenario import Scenario  # noqa: E402
 
 IGNORED = ('version', 'sources', 'origin', 'step_time_us')
