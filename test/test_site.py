@@ -25,6 +25,7 @@ from t3mpc_ros.version import VERSION
 
 SHORT = '6'
 """Duration of each run of an example, s."""
+MKDOCS = ROOT / 'mkdocs.yml'
 NOTEBOOKS = sorted((ROOT / 'examples').glob('*.ipynb'))
 TEXT = 5000
 """Maximum size of what a cell shows beside a picture, bytes."""
@@ -49,10 +50,19 @@ def test_a_notebook_is_stored_without_outputs(path):
 
 def test_every_page_has_a_place_in_the_navigation():
     """Without one the build of the site, which only a long test does, ends."""
-    placed = re.findall(r'^ +- .*: (\w+\.md)$', (ROOT / 'mkdocs.yml').read_text(), re.MULTILINE)
+    placed = re.findall(r'^ +- .*: (\w+\.md)$', MKDOCS.read_text(), re.MULTILINE)
     pages = {path.name for path in (ROOT / 'docs').glob('*.md')}
     assert pages <= {*placed, 'index.md'}
     assert len(placed) == len({*placed})
+
+
+def test_a_module_that_a_page_links_to_is_on_the_site():
+    """The link of the page on patrols was dead: only the programs in docs are left out."""
+    kind = pytest.importorskip('pathspec').GitIgnoreSpec
+    [lines] = re.findall(r'^exclude_docs: \|\n((?:  .*\n)+)', MKDOCS.read_text(), re.MULTILINE)
+    left_out = kind.from_lines(line.strip() for line in lines.splitlines()).match_file
+    assert left_out('gallery.py')
+    assert not left_out('source/t3mpc_ros/geometry/path_smoothing.py')
 
 
 @pytest.mark.long
