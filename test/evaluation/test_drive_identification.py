@@ -265,6 +265,20 @@ def test_a_bag_that_does_not_determine_the_drive_is_refused(tape_of, words, driv
 # The command line
 
 
+def test_what_is_unusual_in_the_bag_stands_in_the_file(tmp_path, driven, capsys):
+    """The file looked as sound as that of a whole bag."""
+
+    def kept(seconds, topic, _):
+        return topic != '/odom' or not 12.0 < seconds < 14.0
+
+    folder = driven.where(kept).write(tmp_path / 'drive')
+    assert main(['tune', '--robot', str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith('# Drive identified from drive: ')
+    assert lines[1].startswith('# No message of /odom for 2.0 s from ')
+    assert lines[2] == '/**/controller:'
+
+
 def test_an_output_that_cannot_be_written_is_said_first(tmp_path, driven, capsys):
     """The file was identified and printed, then: [Errno 21] Is a directory."""
     folder = driven.write(tmp_path / 'drive')

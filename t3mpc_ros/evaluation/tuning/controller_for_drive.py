@@ -76,4 +76,5 @@ def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
         f'Drive identified from {source}: {drive.duration:.1f} s, '
         f'{100 * drive.explained:.1f} % of the wheel speeds explained.'
     )
+    title = '\n# '.join([title, *drive.oddities])
     return parameter_file(title, {'/**/controller': rounded}, comments)

@@ -18,7 +18,7 @@ The model, and the fit of dead time and lag, are those of
 over the period before, whichever fits better.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 
@@ -81,6 +81,8 @@ class IdentifiedDrive:
     rate: float
     """Rate of the odometry, Hz."""
     geometry: WheelGeometry
+    oddities: tuple[str, ...] = ()
+    """Sentences on what is unusual in the bag, as in its report."""
 
 
 def identify_bag(folder: Path, options: ReportOptions) -> tuple[IdentifiedDrive, str]:
@@ -144,7 +146,8 @@ def identify_drive(run: Run) -> IdentifiedDrive:
         window=period,
     )
     fits = [fit_wheels(each, delay) for each in (data, data._replace(window=0.0))]
-    return _identified(fits, period, end - start, run.geometry)
+    drive = _identified(fits, period, end - start, run.geometry)
+    return replace(drive, oddities=run.oddities)
 
 
 def _rough_delay(command: Series, motion: Series) -> float:
