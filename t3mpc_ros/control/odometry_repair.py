@@ -51,12 +51,12 @@ def _duration(last: State, new: State) -> float:
     """Return the time which the motion between two messages took, ns; 0 where it says little."""
     if not (last.is_finite() and new.is_finite()):
         return 0.0
-    ahead, _, turn = motion_between(last.pose, new.pose)
     speed = 0.5 * (last.twist.linear + new.twist.linear)
     arm_speed = 0.5 * STAMP_ARM * (last.twist.angular + new.twist.angular)
     square = speed**2 + arm_speed**2
     if not square > STAMP_MOTION**2:
         return 0.0
+    ahead, _, turn = motion_between(last.pose, new.pose)
     return NANOSECONDS * (ahead * speed + STAMP_ARM * turn * arm_speed) / square
 
 
@@ -353,6 +353,7 @@ class TwistFit:
     def interrupt(self) -> None:
         """Forget the newest messages: some are missing."""
         self._stages: list[list[float]] = []
+        """Of each velocity both stages of the filter, and their sums since the last comparison."""
         self._last: list[float] = []
         self._from: State | None = None
 
@@ -370,31 +371,34 @@ class TwistFit:
         if new.pose.yaw == last.pose.yaw and abs(new.twist.angular) > FIT_MOTION[1]:
             self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
             return
-        ahead, left, turn = (each / elapsed for each in motion)
-        given = [ahead, turn, new.twist.linear, new.twist.angular, left]
-        apart = [abs(given[i] - given[i + 2]) for i in range(2)]
+        ahead, left, turn = motion
+        given = [ahead / elapsed, turn / elapsed, *new.twist, left / elapsed]
+        apart, turned = abs(given[0] - given[2]), abs(given[1] - given[3])
         typical = min(self._interval or elapsed, 2.0 * elapsed)
         self._interval = typical + FIT_INTERVALS * (elapsed - typical)
-        if elapsed > FIT_GAP * typical or any(
-            apart[i] > FAR_BEYOND[i] or apart[i] * elapsed > JUMP[i] for i in range(2)
+        if (
+            elapsed > FIT_GAP * typical
+            or apart > FAR_BEYOND[0]
+            or turned > FAR_BEYOND[1]
+            or apart * elapsed > JUMP[0]
+            or turned * elapsed > JUMP[1]
         ):  # A pose that was set, or messages are missing.
             self.interrupt()
             return
         if not self._stages:
-            self._stages, self._last = [[each, each] for each in given], given
+            self._stages, self._last = [[each, each, 0.0, 0.0] for each in given], given
             self._time = 0.0
             self._begin_row()
             return
         share = -math.expm1(-elapsed / FIT_FILTER)
         for stages, each in zip(self._stages, given, strict=True):
-            stages[0] += share * (each - stages[0])
-            stages[1] += share * (stages[0] - stages[1])
-        # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
-        for sums, stages in zip(self._sums, self._stages, strict=True):
-            sums[0] += elapsed * stages[0]
-            sums[1] += elapsed * stages[1]
-        for i in range(4):
-            self._rough[i] += 0.5 * (given[i] - self._last[i]) ** 2
+            first, second, sum_first, sum_second = stages
+            first += share * (each - first)
+            second += share * (first - second)
+            # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
+            stages[:] = first, second, sum_first + elapsed * first, sum_second + elapsed * second
+        changes = zip(self._rough, given, self._last, strict=False)
+        self._rough[:] = [each + 0.5 * (now - before) ** 2 for each, now, before in changes]
         self._held.update(self._last, given)
         self._last = given
         self._time += elapsed
@@ -408,11 +412,12 @@ class TwistFit:
 
     def _begin_row(self) -> None:
         self._since, self._count = 0.0, 0
-        self._sums = [[0.0, 0.0] for _ in range(5)]
+        for stages in self._stages:
+            stages[2:] = 0.0, 0.0
         self._rough = [0.0] * 4
 
     def _add_row(self) -> None:
-        means = [[each / self._since for each in sums] for sums in self._sums]
+        means = [[each / self._since for each in stages[2:]] for stages in self._stages]
         rates, twists = ([abs(each[1]) for each in part] for part in (means[:2], means[2:4]))
         if all(rates[i] < FIT_MOTION[i] for i in range(2)) or any(
             twists[i] > FIT_SPIN * rates[i] + FIT_SPIN_BEYOND[i] for i in range(2)
@@ -502,17 +507,17 @@ class TwistUnits:
         # That of a camera which is slower than the wheels stays the same for a while.
         times = FAR_UNCHANGED if new.pose == last.pose else 1.0
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        by_pose = motion[0] / elapsed, motion[2] / elapsed
-        if any(
-            abs(twist) > FAR * abs(rate) + times * beyond
-            for twist, rate, beyond in zip(new.twist, by_pose, FAR_BEYOND, strict=True)
+        ahead, turn, (linear, angular) = motion[0] / elapsed, motion[2] / elapsed, new.twist
+        if (
+            abs(linear) > FAR * abs(ahead) + times * FAR_BEYOND[0]
+            or abs(angular) > FAR * abs(turn) + times * FAR_BEYOND[1]
         ):
             self._count = min(self._count + 1, UNITS_MOST)
             self.example = (
-                f'{new.twist.linear:.3g} m/s and {new.twist.angular:.3g} rad/s, where its pose '
-                f'says {by_pose[0]:.3g} and {by_pose[1]:.3g}'
+                f'{linear:.3g} m/s and {angular:.3g} rad/s, where its pose says {ahead:.3g} and '
+                f'{turn:.3g}'
             )
-        elif any(abs(rate) > least for rate, least in zip(by_pose, UNITS_MOTION, strict=True)):
+        elif abs(ahead) > UNITS_MOTION[0] or abs(turn) > UNITS_MOTION[1]:
             self._count = max(self._count - 1, 0)
         self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
 
@@ -643,6 +648,8 @@ class OdometryTwist:
             self._fit.interrupt()
         elif self.known:
             self._fit.update(odometry, motion)
+        if not self.replaced:
+            return odometry
         replaces = [self.missing or self._units.wrong] * 2
         if not any(replaces) and self._fit.wrong:
             replaces = self._fit.uses_pose
