@@ -34,7 +34,8 @@ STAMP_SHARE = 0.05
 """Share by which a regular time follows each stamp: the mean of jitter over 0.4 s."""
 STAMP_FIRST, STAMP_SETTLING, STAMP_GAP = 15, 60, 20.5
 """Intervals whose median is the first period, messages until the times are regular, and the
-interval, in periods, from which they begin anew: any number of messages may be missing."""
+interval, in periods, from which they begin anew: any number of messages may be missing. So many
+intervals of several periods in succession are those of another rate, too."""
 STAMP_LATE = 0.3
 """Part of a period beyond half of it by which a stamp may be late before a message is missing."""
 STAMP_MOTION, STAMP_ARM = 0.05, 0.1
@@ -76,7 +77,7 @@ class StampFilter:
         """Periods since the message before; None where the stamps tell it, as they are used."""
         self._rows = self._stamps = self._times = self._apart = 0.0
         self._last: State | None = None
-        self._origin_ns = self._returned = self._settling = 0
+        self._origin_ns = self._returned = self._settling = self._longer = 0
         self._intervals: list[float] = []
         self._regular = self._period = 0.0
         """Regular time of the last message since the origin, and the interval, ns."""
@@ -87,7 +88,9 @@ class StampFilter:
         self._last, self.periods = odometry, None
         interval = 0.0 if last is None else float(stamp - last.stamp_ns)
         periods = (stamp - self._origin_ns - self._regular) / self._period if self._period else 1.0
-        if last is None or interval <= 0.0 or periods > STAMP_GAP:
+        other = periods > STAMP_GAP or self._longer == STAMP_FIRST
+        if last is None or interval <= 0.0 or other:
+            self._longer = 0
             self._origin_ns = self._returned = stamp
             self._regular = self._period = 0.0
             self._intervals, self._settling = [], STAMP_SETTLING
@@ -103,6 +106,7 @@ class StampFilter:
         if number < 1 or abs(number - periods) > 0.5 + STAMP_LATE:
             # Messages may be missing; one that is late is not.
             number = max(round(periods - STAMP_LATE), int(periods > STAMP_LATE))
+        self._longer = self._longer + 1 if number > 1 else 0
         before = self._regular
         predicted = before + number * self._period
         error = stamp - self._origin_ns - predicted

@@ -522,3 +522,14 @@ def test_a_period_that_changes_is_followed():
     filtered, times = stamped(stamps)
     assert filtered.problem() == ''
     assert times == pytest.approx(stamps, abs=1e-9)
+
+
+def test_a_lower_rate_is_followed_where_stamps_jitter():
+    """Every second message counted as missing, for ever."""
+    generator = np.random.default_rng(3)
+    true = 10.0 + np.cumsum(np.where(np.arange(4000) < 2000, 0.01, 0.02))
+    late = generator.uniform(0.0, 0.004, 4000)
+    filtered, times = stamped(true + late, true, speed=lambda time: 0.2 + 0.1 * math.sin(time))
+    assert filtered.jitters
+    assert filtered.periods == 1
+    assert np.std((times - true)[3000:]) < 0.4 * np.std(late)
