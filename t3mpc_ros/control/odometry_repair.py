@@ -155,9 +155,8 @@ FIT_SETTLING, FIT_ROWS = 0.6, 8
 REVERSED_ROWS, REVERSED = 3, 0.05
 """Comparisons after which a velocity of the other sign is one, and the part of their difference
 (mean squares) that it may leave: one that is late by less than them leaves a third."""
-FIT_GAP, FIT_INTERVALS = 5.0, 0.05
-"""Interval between two messages, as a multiple of the usual one, that is a gap; share by which the
-usual one follows each of them."""
+FIT_GAP = 5.0
+"""Interval between two messages, as a multiple of the one before the comparison, that is a gap."""
 FIT_MOTION = 0.02, 0.1
 """Velocity by the pose (m/s, rad/s), either of them, of a robot that moves."""
 FIT_SPIN, FIT_SPIN_BEYOND = 2.0, (0.05, 0.5)
@@ -378,10 +377,8 @@ class TwistFit:
         ahead, left, turn = motion
         given = [ahead / elapsed, turn / elapsed, *new.twist, left / elapsed]
         apart, turned = abs(given[0] - given[2]), abs(given[1] - given[3])
-        typical = min(self._interval or elapsed, 2.0 * elapsed)
-        self._interval = typical + FIT_INTERVALS * (elapsed - typical)
         if (
-            elapsed > FIT_GAP * typical
+            elapsed > FIT_GAP * (self._interval or elapsed)
             or apart > FAR_BEYOND[0]
             or turned > FAR_BEYOND[1]
             or apart * elapsed > JUMP[0]
@@ -410,6 +407,7 @@ class TwistFit:
         self._count += 1
         if self._since < FIT_ROW:
             return
+        self._interval = self._since / self._count
         if self._time > FIT_SETTLING:
             self._add_row()
         self._begin_row()
