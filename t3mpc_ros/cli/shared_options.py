@@ -20,6 +20,7 @@ from dataclasses import fields
 import os
 from pathlib import Path
 import select
+import signal
 import sys
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -276,10 +277,24 @@ def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     options = parser.parse_args(arguments)
     try:
         prepare_outputs(options)
-        return int(options.run(options) or 0)
+        code = int(options.run(options) or 0)
+        sys.stdout.flush()
+        return code
     except (OSError, RuntimeError, ValueError) as error:
+        if isinstance(error, BrokenPipeError) and _reader_has_ended():
+            return 128 + signal.SIGPIPE
         print(f'error: {sentence(error)}', file=sys.stderr)
         return 1
+
+
+def _reader_has_ended() -> bool:
+    """Return whether nobody reads the standard output, as after ``| head``; then discard it."""
+    asked = select.poll()
+    asked.register(sys.stdout.fileno(), 0)
+    ended = any(event & select.POLLERR for _, event in asked.poll(0))
+    if ended:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return ended
 
 
 def ask_line(question: str, stop: Callable[[], bool]) -> str:

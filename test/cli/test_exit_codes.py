@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 import shlex
 import signal
+import subprocess
 import sys
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -322,3 +323,14 @@ def test_the_code_of_a_process_is_how_it_ended(end, code, tmp_path, monkeypatch)
         group.wait_for('node', 'never')
     with pytest.raises(ProcessError, match=f'node ended with code {code} during the run'):
         group.check()
+
+
+@pytest.mark.slow
+def test_an_output_that_is_cut_off_is_no_error():
+    """``t3mpc topic echo /odom | head`` ended with *error: [Errno 32] Broken pipe*."""
+    code = 'import sys; from t3mpc_ros.cli.main import main; sys.exit(main(sys.argv[1:]))'
+    words = [sys.executable, '-c', code, 'exponents', '--duration', '1']
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        child.stdout.close()
+        assert child.stderr.read() == b''
+    assert child.returncode == 128 + signal.SIGPIPE
