@@ -35,7 +35,11 @@ from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 
 KEY = bytes(range(16))
 ABSENT = 'the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?'
-LATCHED = 'the emergency stop of the robot is latched'
+LATCHED = (
+    'the emergency stop of the robot is latched: release its button, then call e_stop of '
+    'radio_bridge with false'
+)
+"""A jog or the checklist said only the first words, as remedy."""
 
 
 def driving(bench):

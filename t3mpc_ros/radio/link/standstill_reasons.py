@@ -65,7 +65,10 @@ COMMAND_EXPIRED = 'the last command has expired'
 TTL_EXPIRED = 'no command reached the robot in time: it stopped by itself'
 SESSION_LOST = 'the robot has lost its session'
 OTHER_ROBOT = 'another robot answers'
-ROBOT_ESTOP = 'the emergency stop of the robot is latched'
+ROBOT_ESTOP = (
+    'the emergency stop of the robot is latched: release its button, then call e_stop of '
+    'radio_bridge with false'
+)
 ESTOP_BUTTON_HELD = 'the emergency stop of the robot stays latched: is its button still pressed?'
 SHUT_DOWN = 'the link is shut down'
 
