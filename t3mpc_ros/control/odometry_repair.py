@@ -359,6 +359,8 @@ class TwistFit:
         """Of each velocity both stages of the filter, and their sums since the last comparison."""
         self._last: list[float] = []
         self._from: State | None = None
+        self._held_for, self._held_way = 0.0, [0.0, 0.0]
+        """Time for which the pose has been the same (s), and way by the twist since then."""
 
     def update(self, new: State, motion: tuple[float, float, float]) -> None:
         """Compare the twist of a message with the motion since the last one."""
@@ -366,16 +368,21 @@ class TwistFit:
         if last is None:
             return
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        way = [each * (elapsed - self._held_for) for each in new.twist]
+        self._held_way = [held + each for held, each in zip(self._held_way, way, strict=True)]
         if new.pose == last.pose:  # the robot stands, or a camera holds it for a while
-            self._from = last
+            self._from, self._held_for = last, elapsed
             if elapsed > FIT_SETTLING:
                 self.interrupt()
             return
+        # Coarse counters hold it as well: the twist is zero then, and double in other messages.
+        held = [each / elapsed for each in self._held_way] if self._held_for else None
+        self._held_for, self._held_way = 0.0, [0.0, 0.0]
         if new.pose.yaw == last.pose.yaw and abs(new.twist.angular) > FIT_MOTION[1]:
             self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
             return
         ahead, left, turn = motion
-        given = [ahead / elapsed, turn / elapsed, *new.twist, left / elapsed]
+        given = [ahead / elapsed, turn / elapsed, *(held or new.twist), left / elapsed]
         apart, turned = abs(given[0] - given[2]), abs(given[1] - given[3])
         if (
             elapsed > FIT_GAP * (self._interval or elapsed)
@@ -527,6 +534,60 @@ class TwistUnits:
 HELD_MOST, HELD_MEMORY = 0.25, 0.97
 """Longest time for which a robot that drives may have one pose (s); share of the longest time of
 late that is kept with each other pose."""
+BLANKS, BLANK_TIME, BLANKS_MEMORY = 3, 0.1, 5.0
+"""Gaps in the twist after which they are filled; the longest that is one, and the time after which
+they are forgotten, s."""
+BLANK_MOTION = 0.5
+"""Share of the way by the twist before a gap that the pose must go in it: it repeats the old pose
+where wheels with coarse counters have not moved."""
+
+
+class TwistBlanks:
+    """Messages without a twist among others: it is zero, and the pose moves on as before."""
+
+    def __init__(self) -> None:
+        self._count, self._counted_ns = 0, 0
+        self._last: State | None = None
+        """Last message with a twist."""
+        self._blank: State | None = None
+        """Last message without, since then."""
+
+    def interrupt(self) -> None:
+        """Forget the last messages."""
+        self._last = self._blank = None
+
+    @property
+    def known(self) -> bool:
+        """Whether there are some."""
+        return self._count >= BLANKS
+
+    def has(self, odometry: State) -> bool:
+        """Whether a message is one of them."""
+        last, blank = self._last, self._blank
+        if odometry.twist == STANDSTILL:
+            self._blank = odometry
+            return self.known and last is not None and _goes_on(last, odometry, last.twist)
+        if last is not None and blank is not None and _goes_on(last, blank, odometry.twist):
+            self._count = min(self._count + 1, BLANKS)
+            self._counted_ns = odometry.stamp_ns
+        elif odometry.stamp_ns - self._counted_ns > BLANKS_MEMORY * NANOSECONDS:
+            self._count = 0
+        self._last, self._blank = odometry, None
+        return False
+
+
+def _goes_on(last: State, blank: State, twist: BodyTwist) -> bool:
+    """Whether the pose goes on as by the twist of the last message and a like one."""
+    seconds = (blank.stamp_ns - last.stamp_ns) / NANOSECONDS
+    ahead, _, turn = motion_between(last.pose, blank.pose)
+    return 0.0 < seconds <= BLANK_TIME and any(
+        before * after > least**2 and way / before > BLANK_MOTION * seconds
+        for way, before, after, least in zip(
+            (ahead, turn), last.twist, twist, FIT_MOTION, strict=True
+        )
+    )
+
+
 LATENESS_SHARE = 0.1  # share by which the lateness of the speeds follows each new pose
 
 
@@ -581,6 +642,7 @@ class OdometryTwist:
         self._fit = TwistFit()
         self._by_pose = PoseSpeeds()
         self._units = TwistUnits()
+        self._blanks = TwistBlanks()
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
         self._last: State | None = None
@@ -589,7 +651,8 @@ class OdometryTwist:
     def replaced(self) -> bool:
         """Whether the twist that is used is not the one that was received."""
         fit = self._fit
-        return self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
+        wrong = self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
+        return wrong or self._blanks.known
 
     @property
     def lateness(self) -> float:
@@ -608,6 +671,11 @@ class OdometryTwist:
                 f'the twist in odom cannot be in m/s and rad/s: {self._units.example}; its poses '
                 'are differentiated: correct the units in the driver of the robot, or see why its '
                 'wheels spin'
+            )
+        if self._blanks.known:
+            return (
+                'odom has no twist in some of its messages, while its pose moves: the change '
+                'of the pose is used in its place, publish the twist in each message'
             )
         if self._fit.wrong:
             return (
@@ -629,9 +697,12 @@ class OdometryTwist:
         pose, last, self._last = odometry.pose, self._last, odometry
         if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
             last = None
+            self._blanks.interrupt()
         motion = None if last is None else motion_between(last.pose, pose)
         elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
         by_pose = self._by_pose.update(odometry, elapsed, motion)
+        if self._blanks.has(odometry) and last is not None:
+            odometry = odometry._replace(twist=BodyTwist(*by_pose))
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
             if last is not None and motion is not None:

@@ -252,10 +252,6 @@ WRONG = {
     'one period late': (delayed(1), 's behind'),
     '50 ms late': (delayed(5), '0.05'),
     'of every fifth message': (lambda k, pose, h: h[k - k % 5], 's behind'),
-    'of every second message': (
-        lambda k, pose, h: h[k] if k % 2 else (0.0, 0.0),
-        'does not follow',
-    ),
     'of the world': (
         lambda k, pose, h: (h[k][0] * math.cos(pose.yaw), h[k][1]),
         'does not follow',
@@ -293,6 +289,59 @@ def test_a_twist_that_the_pose_contradicts_is_replaced(fault, seed):
     assert text in twist.problem()
     assert twist.problem().startswith('the twist in odom is wrong: its ')
     assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+def blank(is_blank, change=lambda given: given):
+    return lambda k, pose, history: (0.0, 0.0) if is_blank(k) else change(history[k])
+
+
+BLANKS = {
+    'every second': lambda k: k % 2,
+    'two of three': lambda k: k % 3,
+    'nine of ten': lambda k: k % 10,
+    'one in ten, at random': lambda k: np.random.default_rng(k).random() < 0.1,
+}
+
+
+@pytest.mark.parametrize('which', BLANKS)
+@pytest.mark.parametrize('seed', range(2))
+def test_a_message_without_a_twist_gets_one_by_its_pose(which, seed):
+    """One in two was found after seconds: 1.29 times the error of simple methods, now 1.01."""
+    twist, errors = contradicted(blank(BLANKS[which]), seed=seed, seconds=3.0)
+    assert twist.problem().startswith('odom has no twist in some of its messages')
+    limit = 5.0 * np.array([0.005, 0.06]) + (0.02, 0.06)
+    assert (np.abs(errors[120:]) < limit).all()
+
+
+@pytest.mark.parametrize('speed', [0.004, 0.02, 0.05, 0.2])
+def test_wheels_with_coarse_counters_stand_between_two_steps(speed):
+    """Each step of a counter, 1 mm, is a twist of 0.1 m/s for a message; the pose moves in it.
+
+    The fit left out the messages between: the twist was said to be twice the change of the pose.
+    """
+    twist, ways = OdometryTwist(), [round(speed * 0.01 * k, 3) for k in range(1000)]
+    for k, (last, way) in enumerate(zip([0.0, *ways], ways, strict=False)):
+        given = BodyTwist((way - last) / 0.01, 0.0)
+        used = twist.measured(State(k * 10 * MS, Pose(way, 0.0, 0.0), given), restart=k == 0)
+        assert used.twist == given
+    assert twist.problem() == ''
+
+
+def test_a_robot_that_stops_and_goes_has_no_twist_as_it_stands():
+    twist, way = OdometryTwist(), 0.0
+    for k in range(1000):
+        given = BodyTwist(0.2 if k % 20 < 13 else 0.0, 0.0)
+        way += 0.01 * given.linear
+        used = twist.measured(State(k * 10 * MS, Pose(way, 0.0, 0.0), given), restart=k == 0)
+        assert used.twist == given
+    assert twist.problem() == ''
+
+
+def test_messages_without_a_twist_are_forgotten_after_a_while():
+    twist, _ = contradicted(blank(lambda k: k % 2 and k < 200), seconds=6.9)
+    assert twist.problem() != ''
+    twist, _ = contradicted(blank(lambda k: k % 2 and k < 200), seconds=7.1)
+    assert twist.problem() == ''
 
 
 REVERSED = {
