@@ -39,8 +39,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import map_jobs
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import FULL, LMS, SHAPED_IN_TIME, methods_for
-from t3mpc_ros.evaluation.record import Numbers, measure
+from t3mpc_ros.evaluation.method_table import FULL, LMS, SHAPED_IN_TIME, methods_for
+from t3mpc_ros.evaluation.run_record import Numbers, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import twist_from_wheels
 from t3mpc_ros.simulation.digital_twin import DigitalTwin

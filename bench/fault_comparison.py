@@ -45,10 +45,10 @@ from t3mpc_ros.control.odometry_monitor import OdometryMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
-from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable, map_jobs
 from t3mpc_ros.evaluation.loop import ReportLink
-from t3mpc_ros.evaluation.methods import (
+from t3mpc_ros.evaluation.loop_drivers import NodeDriver, NodeMethod
+from t3mpc_ros.evaluation.method_table import (
     EXACT_MODEL,
     FEED_FORWARD,
     FULL,
@@ -57,9 +57,9 @@ from t3mpc_ros.evaluation.methods import (
     SHAPED_IN_TIME,
     methods_for,
 )
-from t3mpc_ros.evaluation.record import RATE, measure, stamp_of
-from t3mpc_ros.evaluation.reporting import replace_section
 from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.result_formats import replace_section
+from t3mpc_ros.evaluation.run_record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.robot.interface import RobotState

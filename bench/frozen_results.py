@@ -42,10 +42,10 @@ from support import robot_bags  # noqa: E402
 from t3mpc_ros.bag.reader import open_bag  # noqa: E402
 from t3mpc_ros.cli.main import main as t3mpc  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics  # noqa: E402
-from t3mpc_ros.evaluation.bag_report.run_data import load_run  # noqa: E402
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run  # noqa: E402
 from t3mpc_ros.evaluation.cases import ROBOTS  # noqa: E402
 from t3mpc_ros.evaluation.experiment import measured_run  # noqa: E402
-from t3mpc_ros.evaluation.methods import methods_for  # noqa: E402
+from t3mpc_ros.evaluation.method_table import methods_for  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller  # noqa: E402
 from t3mpc_ros.evaluation.scenario import Scenario  # noqa: E402

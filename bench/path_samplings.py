@@ -35,7 +35,7 @@ from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     TwistLimiter,
 )
 from t3mpc_ros.evaluation.patrol.tracking_study import errors_of
-from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_smoothing import SmoothedPath
 from t3mpc_ros.geometry.path_timing import time_path

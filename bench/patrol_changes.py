@@ -47,8 +47,8 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     run_patrol,
 )
-from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.run_key import digest
+from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change
 from t3mpc_ros.localization.localizer import Localizer

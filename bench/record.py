@@ -30,7 +30,7 @@ import time
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from t3mpc_ros.parameters.provenance import machine, provenance  # noqa: E402
+from t3mpc_ros.parameters.version_and_commit import machine, provenance  # noqa: E402
 
 
 def main() -> int:

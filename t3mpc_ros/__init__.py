@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.own_reference import Waypoints
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
     from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
-    from t3mpc_ros.evaluation.api.script_parts import Controller
+    from t3mpc_ros.evaluation.api.script_inputs import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.cases import LinkFaults
@@ -79,7 +79,7 @@ _HOMES = {
     'evaluation.api.own_reference': ('Waypoints',),
     'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
     'evaluation.api.plants': ('OdePlant', 'Robot', 'StateSpace'),
-    'evaluation.api.script_parts': ('Controller',),
+    'evaluation.api.script_inputs': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),
     'evaluation.cases': ('LinkFaults',),

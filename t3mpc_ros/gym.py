@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
-from t3mpc_ros.evaluation.api.script_parts import Controller, OwnMethod, own_scenario
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
+from t3mpc_ros.evaluation.api.script_inputs import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import LinkFaults
-from t3mpc_ros.evaluation.drivers import MethodDriver
 from t3mpc_ros.evaluation.loop import scenario_reports, with_scenario
-from t3mpc_ros.evaluation.record import RATE, Record, measure
+from t3mpc_ros.evaluation.loop_drivers import MethodDriver
+from t3mpc_ros.evaluation.run_record import RATE, Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.missing_library import remedy

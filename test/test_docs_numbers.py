@@ -26,7 +26,7 @@ from bench import path_samplings
 import t3mpc_ros as t3
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.experiment import measured_run
-from t3mpc_ros.evaluation.methods import methods_for
+from t3mpc_ros.evaluation.method_table import methods_for
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.patrol.tracking_study import (
     TRACKED_PATHS,

@@ -36,7 +36,7 @@ import yaml
 
 from t3mpc_ros.cli import bag, emulator, robot
 from t3mpc_ros.cli.main import _parser
-from t3mpc_ros.evaluation.api.script_parts import Controller
+from t3mpc_ros.evaluation.api.script_inputs import Controller
 from t3mpc_ros.nodes.arguments import unknown_arguments
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 

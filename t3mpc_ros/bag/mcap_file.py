@@ -39,7 +39,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from t3mpc_ros.bag.errors import BagError
-from t3mpc_ros.bag.metadata import NO_START_NS, BagMetadata, FileInformation, TopicInformation
+from t3mpc_ros.bag.metadata_yaml import NO_START_NS, BagMetadata, FileInformation, TopicInformation
 from t3mpc_ros.bag.qos import QosError, QosProfile, profiles_from_yaml
 
 MCAP_SUFFIX = '.mcap'

@@ -28,7 +28,7 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
-from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.reader import BagFile, BagReader, merge_streams, merge_topics, open_bag
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, parse_remappings
 from t3mpc_ros.geometry.types import NANOSECONDS

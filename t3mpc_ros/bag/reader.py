@@ -34,7 +34,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from t3mpc_ros.bag import mcap_file
 from t3mpc_ros.bag.errors import BagError, DataError, UnknownTopicError
-from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, TopicInformation
+from t3mpc_ros.bag.metadata_yaml import METADATA_FILE_NAME, TopicInformation
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.writer import AttachmentError, read_attachment
 from t3mpc_ros.model_file import find_model
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.version_and_commit import provenance
 
 SEED_RECORD = 'seed_fingerprints'
 """Name of the metadata record with the seed fingerprint of each reference generator."""

@@ -25,7 +25,7 @@ import re
 from t3mpc_ros.bag.errors import BagError, DataError, UnknownTypeError
 from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
-from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.geometry.types import NANOSECONDS

@@ -30,7 +30,12 @@ from t3mpc_ros.atomic_file import sync_folder
 from t3mpc_ros.bag.errors import BagError, DataError, UnknownTopicError
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
-from t3mpc_ros.bag.metadata import BagMetadata, FileInformation, TopicInformation, write_metadata
+from t3mpc_ros.bag.metadata_yaml import (
+    BagMetadata,
+    FileInformation,
+    TopicInformation,
+    write_metadata,
+)
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -45,7 +45,7 @@ import math
 import numpy as np
 
 from t3mpc_ros.chaos.sum_of_exponentials import exp, expm1, fit_sum_of_exponentials
-from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
+from t3mpc_ros.chaos.system_equations import QuadraticSystem, Terms, right_hand_side
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 

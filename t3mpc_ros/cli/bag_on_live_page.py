@@ -23,7 +23,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report.incidents import UNDER_WAY, exceeds
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.evaluation.topic_roles import ReportOptions, bag_display_name
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.simulation.world import world_outline

@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.api.result_tables import writable
     from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.reporting import columns_of, write_columns
+    from t3mpc_ros.evaluation.result_formats import columns_of, write_columns
 
     plan = _plan(options)
     with shared_options.executor_of(options) as executor:
@@ -98,9 +98,9 @@ def _plan(options: argparse.Namespace) -> 'ComparisonPlan':
     the comparison.
     """
     from t3mpc_ros.evaluation.api.comparison_runs import make_plan
-    from t3mpc_ros.evaluation.api.script_parts import own_scenario
+    from t3mpc_ros.evaluation.api.script_inputs import own_scenario
     from t3mpc_ros.evaluation.comparison import ComparisonPlan
-    from t3mpc_ros.evaluation.methods import default_methods, methods_for, require_libraries
+    from t3mpc_ros.evaluation.method_table import default_methods, methods_for, require_libraries
     from t3mpc_ros.parameters.table import find_names
 
     own = bool(options.own or options.reference or options.robot not in shared_options.ROBOTS)

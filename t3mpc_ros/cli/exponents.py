@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the exponents and their sum."""
-    from t3mpc_ros.chaos.system import hyperchaotic_system
+    from t3mpc_ros.chaos.system_equations import hyperchaotic_system
     from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 
     values = lyapunov_exponents(hyperchaotic_system(orders=(1.0,) * 4), duration=options.duration)

@@ -51,7 +51,7 @@ def add_parser(commands: shared_options.Commands) -> None:
 def run(options: argparse.Namespace) -> None:
     """Write everything."""
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.methods import NMPC, require_libraries
+    from t3mpc_ros.evaluation.method_table import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import reproduce
 
     require_libraries([NMPC])

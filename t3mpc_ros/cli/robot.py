@@ -32,7 +32,7 @@ from t3mpc_ros.cli.shared_options import (
     prepare_outputs,
     print_result,
 )
-from t3mpc_ros.evaluation.api.error_messages import sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import sentence
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_file import file_errors, read_yaml

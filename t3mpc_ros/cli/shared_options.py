@@ -25,7 +25,7 @@ import sys
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from t3mpc_ros.atomic_file import check_new_folder, write_atomically
-from t3mpc_ros.evaluation.api.error_messages import sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import sentence
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.version import VERSION
@@ -102,7 +102,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 
 def setting_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return what :func:`add_setting` added, as arguments of a function of the interface."""
-    from t3mpc_ros.evaluation.api.script_parts import loaded
+    from t3mpc_ros.evaluation.api.script_inputs import loaded
 
     return {
         'plant': options.robot if options.robot in ROBOTS else loaded(options.robot),
@@ -124,7 +124,7 @@ def print_result(
     options: argparse.Namespace, text: Callable[[], str], record: Callable[[], object]
 ) -> None:
     """Print a result as text, and write it to the file of ``--json``; ``-``: print only JSON."""
-    from t3mpc_ros.evaluation.reporting import strict_json
+    from t3mpc_ros.evaluation.result_formats import strict_json
 
     if options.json == STANDARD_OUTPUT:
         print(strict_json(record()), end='')

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
         _identify(options)
         return
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.methods import (
+    from t3mpc_ros.evaluation.method_table import (
         further_definitions,
         method_definitions,
         require_libraries,

@@ -20,7 +20,7 @@ import math
 import statistics
 from typing import Any, TypeVar
 
-from t3mpc_ros.evaluation import record
+from t3mpc_ros.evaluation import run_record
 from t3mpc_ros.evaluation.baselines.baseline_controller import EXACT_INERTIA, FRICTION
 from t3mpc_ros.evaluation.cases import CASES
 from t3mpc_ros.evaluation.confidence_intervals import (
@@ -30,10 +30,10 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     interval,
     mean,
 )
-from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.loop import ComparedMethod, scenario_reports
-from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
+from t3mpc_ros.evaluation.loop_drivers import MethodSpec
+from t3mpc_ros.evaluation.method_table import FEED_FORWARD, FULL, MODEL_ERROR
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.scenario import LEAD, PRETRAINING_SEEDS, TUNING_SEEDS, Scenario
 
@@ -44,7 +44,7 @@ BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 LEVEL = 0.05
 """Largest probability of one wrong verdict in a table."""
 Key = TypeVar('Key', bound=Hashable)
-Judged = Mapping[tuple[str, str, record.Metric], tuple[Difference, str]]
+Judged = Mapping[tuple[str, str, run_record.Metric], tuple[Difference, str]]
 """Differences with their verdicts by method, case and metric."""
 
 
@@ -124,7 +124,7 @@ def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = Non
 
 
 def difference(
-    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: record.Metric
+    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: run_record.Metric
 ) -> Difference | None:
     """Return the paired difference from the method of reference; None for itself or without it."""
     first, second = ({'controller': name, 'case': case} for name in (method, plan.against))
@@ -166,11 +166,11 @@ def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str
     return {(method, case): verdict for (method, case, _), (_, verdict) in judged.items()}
 
 
-def judged_metrics(case: str) -> tuple[record.Metric, ...]:
+def judged_metrics(case: str) -> tuple[run_record.Metric, ...]:
     """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
     if CASES[case].body:
-        return record.YAW_RATE_SETTLED, record.YAW_RATE, record.DRIFT
-    return record.SETTLED, record.OVERALL
+        return run_record.YAW_RATE_SETTLED, run_record.YAW_RATE, run_record.DRIFT
+    return run_record.SETTLED, run_record.OVERALL
 
 
 def summary_table(
@@ -190,12 +190,14 @@ def summary_table(
         for case, metric in firsts.items():
             cell = _cell(results.values(metric.name, case=case, controller=method), metric)
             cells.append(f'{cell} {judged.get((method, case), "")}'.rstrip())
-        variation = results.values(record.VARIATION.name, case=plan.cases[0], controller=method)
-        cells.append(_cell(variation, record.VARIATION))
+        variation = results.values(
+            run_record.VARIATION.name, case=plan.cases[0], controller=method
+        )
+        cells.append(_cell(variation, run_record.VARIATION))
         if step_times:
             cells.append(f'{step_times[method]:.0f}')
         rows.append(tuple(cells))
-    body = [case for case, metric in firsts.items() if metric is not record.SETTLED]
+    body = [case for case, metric in firsts.items() if metric is not run_record.SETTLED]
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
@@ -203,7 +205,7 @@ def summary_table(
     head = [
         'method',
         *plan.cases,
-        f'{record.VARIATION.heading}, {plan.cases[0]}, {record.VARIATION.unit}',
+        f'{run_record.VARIATION.heading}, {plan.cases[0]}, {run_record.VARIATION.unit}',
     ]
     head += ['step, µs'] if step_times else []
     return Table(title, head, rows, (FULL,), wrap=True, notes=_verdict_notes(plan, len(judged)))
@@ -220,7 +222,7 @@ def _verdict_notes(plan: ComparisonPlan, count: int) -> list[str]:
     return [text] if count else []
 
 
-def _cell(values: Sequence[float], metric: record.Metric) -> str:
+def _cell(values: Sequence[float], metric: run_record.Metric) -> str:
     """Return mean ± half the interval and the number of seeds, or how many diverged."""
     if diverged := sum(map(math.isnan, values)):
         return f'{diverged} of {len(values)} diverged'
@@ -233,11 +235,11 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
     first = results.where(case=case, controller=next(iter(plan.methods)))[0]
     metrics = [
         metric
-        for metric in record.METRICS
+        for metric in run_record.METRICS
         if metric.name in first
         and (
-            metric is not record.STOPPED
-            or any(each > 0.0 for each in results.values(record.STOPPED.name, case=case))
+            metric is not run_record.STOPPED
+            or any(each > 0.0 for each in results.values(run_record.STOPPED.name, case=case))
         )
     ]
     judged = judged_metrics(case)
@@ -315,7 +317,7 @@ def description(plan: ComparisonPlan) -> str:
     kind = plan.scenario.kind
     before, after = kind.settling
     text += (
-        f'The first {record.START:g} s of control do not count. Settled: without {before:g} s '
+        f'The first {run_record.START:g} s of control do not count. Settled: without {before:g} s '
         f'before and {after:g} s after each switch. '
     )
     if kind.has_gyro:

@@ -30,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.continuity import parts
-from t3mpc_ros.evaluation.bag_report.run_data import Series
+from t3mpc_ros.evaluation.bag_report.motion_continuity import parts
+from t3mpc_ros.evaluation.bag_report.recorded_run import Series
 from t3mpc_ros.evaluation.confidence_intervals import student_quantile
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel

@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
-from t3mpc_ros.evaluation.record import RATE, Record, broken_off, stamp_of, switch_times
+from t3mpc_ros.evaluation.run_record import RATE, Record, broken_off, stamp_of, switch_times
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.robot.interface import RobotCommand, RobotState

@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from t3mpc_ros.chaos.system import QuadraticSystem, Terms, jacobian, right_hand_side
+from t3mpc_ros.chaos.system_equations import QuadraticSystem, Terms, jacobian, right_hand_side
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 

@@ -54,8 +54,8 @@ def digest(*parts: Any) -> str:
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'model_file.py',
     'evaluation/bag_report/', 'evaluation/process_replay/', 'evaluation/comparison',
-    'evaluation/fault_page.py', 'evaluation/html_page.py', 'evaluation/plotting.py',
-    'evaluation/report_table.py', 'evaluation/reporting.py', 'evaluation/result_file.py',
+    'evaluation/fault_page.py', 'evaluation/html_page.py', 'evaluation/figure_style.py',
+    'evaluation/report_table.py', 'evaluation/result_formats.py', 'evaluation/result_file.py',
     'evaluation/paper/',
     'evaluation/patrol/patrol_page.py', 'evaluation/patrol/tracking_page.py',
 )  # fmt: skip

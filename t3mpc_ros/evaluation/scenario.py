@@ -28,7 +28,7 @@ from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, LinkFaults, cases_for
-from t3mpc_ros.evaluation.record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_of
+from t3mpc_ros.evaluation.run_record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_of
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, find_names

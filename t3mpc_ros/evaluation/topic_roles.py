@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from t3mpc_ros.control.controller import SCALAR_NAMES
 
 if TYPE_CHECKING:  # a figure of a simulated run needs the names only
-    from t3mpc_ros.bag.metadata import TopicInformation
+    from t3mpc_ros.bag.metadata_yaml import TopicInformation
     from t3mpc_ros.bag.reader import BagReader
 
 TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'

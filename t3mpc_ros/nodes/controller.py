@@ -28,7 +28,7 @@ from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.bag.controller_journal import Journal, parameters_to_json
+from t3mpc_ros.bag.controller_input_journal import Journal, parameters_to_json
 from t3mpc_ros.control.controller import (
     SCALAR_NAMES,
     Controller,

@@ -42,7 +42,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
-from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.nodes import ros_messages, topic_endpoints

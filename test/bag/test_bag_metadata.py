@@ -22,7 +22,7 @@ from textwrap import indent
 import pytest
 from rosbags.rosbag2.metadata import parse_qos
 
-from t3mpc_ros.bag.metadata import (
+from t3mpc_ros.bag.metadata_yaml import (
     NO_START_NS,
     BagMetadata,
     FileInformation,

@@ -35,7 +35,7 @@ from t3mpc_ros.bag import writer as writer_module
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
-from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
+from t3mpc_ros.bag.metadata_yaml import BagMetadata, read_origin, write_metadata
 from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag

@@ -25,7 +25,12 @@ from support.long_tests import few_of
 
 from t3mpc_ros.chaos.solver import FractionalSolver, mode_weights
 from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
-from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, jacobian, right_hand_side
+from t3mpc_ros.chaos.system_equations import (
+    QuadraticSystem,
+    hyperchaotic_system,
+    jacobian,
+    right_hand_side,
+)
 
 ONE = np.ones(1)
 START = np.array([1.0, 1.0, 1.0, 1.0])

@@ -23,7 +23,7 @@ from support.page_data import read_all
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag_on_live_page import recorded_run
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.view.live_data import STEP
 

@@ -150,14 +150,14 @@ COMPARE = {
     'evaluation.comparison.markdown': '',
     'evaluation.comparison_page.record': {},
     'evaluation.comparison_page.page': '',
-    'evaluation.methods.require_libraries': None,
+    'evaluation.method_table.require_libraries': None,
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
     for name in ('patrol', 'tracking')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
-    'evaluation.plotting.write_pictures': {},
+    'evaluation.figure_style.write_pictures': {},
     'evaluation.patrol.patrol_comparison.compare_patrols': SimpleNamespace(
         table=SimpleNamespace(keys=())
     ),
@@ -172,7 +172,7 @@ PATROL = {
     'evaluation.patrol.localization_study.markdown': '',
 }
 TUNE = {
-    'evaluation.methods.require_libraries': None,
+    'evaluation.method_table.require_libraries': None,
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.tune_methods.tune_twin': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
@@ -311,7 +311,7 @@ TABLE = {
         },
     ),
     'paper': (
-        {PAPER: ('', {}), 'evaluation.methods.require_libraries': None, **SHARED},
+        {PAPER: ('', {}), 'evaluation.method_table.require_libraries': None, **SHARED},
         {
             '': {'reproduce.output': 'runs/paper', 'reproduce.seeds': None},
             '--quick': {

@@ -31,7 +31,7 @@ from support.velocity_robot import VelocityRobot
 import yaml
 
 from bench import other_robots
-from t3mpc_ros.bag.controller_journal import Event
+from t3mpc_ros.bag.controller_input_journal import Event
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.jump_transition import CommandLimit

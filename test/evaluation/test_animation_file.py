@@ -31,7 +31,7 @@ from t3mpc_ros.evaluation.bag_report.animation_file import (
     RangeReadings,
     animate_bag,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import tracking_error
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.simulation.world import World

@@ -44,10 +44,15 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     estimation_target,
     path_of,
 )
+from t3mpc_ros.evaluation.bag_report.recorded_run import (
+    SIGNAL_NAMES,
+    Series,
+    geometry_of,
+    load_run,
+)
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_comparison import error_differences
-from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Series, geometry_of, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
     driven_and_settled,
@@ -56,7 +61,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
-from t3mpc_ros.evaluation.record import SETTLED, MeasuredRun, Record
+from t3mpc_ros.evaluation.run_record import SETTLED, MeasuredRun, Record
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     NAMES,

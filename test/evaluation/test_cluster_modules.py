@@ -19,7 +19,7 @@ import sys
 import pytest
 
 from t3mpc_ros.evaluation import cluster_modules
-from t3mpc_ros.evaluation.api.script_parts import FileController
+from t3mpc_ros.evaluation.api.script_inputs import FileController
 from t3mpc_ros.evaluation.cluster_modules import SourceText, own_sources, run_carried
 from t3mpc_ros.evaluation.run_key import source_digest
 from t3mpc_ros.script_error import ScriptError

@@ -52,9 +52,9 @@ from t3mpc_ros.evaluation.comparison import (
 )
 from t3mpc_ros.evaluation.comparison_page import front, record
 from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, paired
-from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.loop import ReportLink, run
-from t3mpc_ros.evaluation.methods import (
+from t3mpc_ros.evaluation.loop_drivers import MethodDriver, MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.method_table import (
     FEED_FORWARD,
     FULL,
     FULL_WRONG,
@@ -66,7 +66,7 @@ from t3mpc_ros.evaluation.methods import (
     default_methods,
     methods_for,
 )
-from t3mpc_ros.evaluation.record import SETTLED, measure
+from t3mpc_ros.evaluation.run_record import SETTLED, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 

@@ -29,18 +29,18 @@ import pytest
 from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
+from t3mpc_ros.evaluation import comparison_page, fault_page, figure_style
 from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution
 from t3mpc_ros.evaluation.api.parameter_sweep import Sweep
 from t3mpc_ros.evaluation.api.single_run import RunResult
 from t3mpc_ros.evaluation.comparison import ComparisonPlan, first_verdicts
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import FULL, methods_for
+from t3mpc_ros.evaluation.method_table import FULL, methods_for
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
+from t3mpc_ros.evaluation.paper.paper_study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.paper.paper_tables import Results
-from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.patrol import patrol_page, tracking_page
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, visits
@@ -53,7 +53,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     FieldComparison,
     Tolerances,
 )
-from t3mpc_ros.evaluation.record import METRICS
+from t3mpc_ros.evaluation.run_record import METRICS
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.simulation.world import World
 
@@ -391,7 +391,7 @@ def caught(monkeypatch):
         if (figure := draw(subject)) is not None:
             figures.append(figure)
 
-    for module in (comparison_page, fault_page, plotting):
+    for module in (comparison_page, fault_page, figure_style):
         monkeypatch.setattr(module, 'drawing', instead)
     return figures
 
@@ -681,13 +681,16 @@ def test_solutions_of_the_chaotic_system_are_drawn_by_state():
 
 def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
     def draw(values):
-        figure = plotting.new_figure(2.0)
+        figure = figure_style.new_figure(2.0)
         figure.subplots().plot(values)
         return figure
 
     files = {
-        kind: [plotting.file_of(plotting.drawing(draw, [1.0, 3.0, 2.0]), kind) for _ in range(2)]
-        for kind in plotting.DATES
+        kind: [
+            figure_style.file_of(figure_style.drawing(draw, [1.0, 3.0, 2.0]), kind)
+            for _ in range(2)
+        ]
+        for kind in figure_style.DATES
     }
     assert all(first == again for first, again in files.values())
     assert files['png'][0].startswith(b'\x89PNG')
@@ -708,10 +711,10 @@ def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
 )
 def test_the_ticks_of_an_axis_are_plain_numbers(values, near, scale):
     """Differences within 0.01 rad/s had ticks like -5.07817 x 10^-3."""
-    figure = plotting.new_figure(2.0)
+    figure = figure_style.new_figure(2.0)
     panel = figure.subplots()
     panel.plot(values, values, 'o')
-    plotting.scale_by_size(panel, 'x', values, near)
+    figure_style.scale_by_size(panel, 'x', values, near)
     assert panel.get_xscale() == scale
     figure.canvas.draw()
     shown = [text.get_text() for text in panel.get_xticklabels() if text.get_text()]

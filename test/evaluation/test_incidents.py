@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.bag_report.incidents import (
     find_stalls,
     find_stops,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import Series, Timing
+from t3mpc_ros.evaluation.bag_report.recorded_run import Series, Timing
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 

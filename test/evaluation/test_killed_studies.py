@@ -23,10 +23,10 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.evaluation.api import parameter_sweep
-from t3mpc_ros.evaluation.methods import FULL, method_definitions, methods
-from t3mpc_ros.evaluation.paper import reproduce, study
+from t3mpc_ros.evaluation.method_table import FULL, method_definitions, methods
+from t3mpc_ros.evaluation.paper import paper_study, reproduce
+from t3mpc_ros.evaluation.paper.paper_study import Extent
 from t3mpc_ros.evaluation.paper.reproduce import run_study
-from t3mpc_ros.evaluation.paper.study import Extent
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
@@ -57,7 +57,7 @@ def paper(folder, begun, monkeypatch):
         return {'rmse': scenario.seed / 3.0, 'settled': math.nan, 'chatter': len(method.name)}
 
     monkeypatch.setattr(reproduce, 'measured_run', measured)
-    monkeypatch.setattr(study, 'methods', lambda drive: {FULL: methods(drive)[FULL]})
+    monkeypatch.setattr(paper_study, 'methods', lambda drive: {FULL: methods(drive)[FULL]})
     extent = Extent((101, 102), 6.0, ('nominal',), (0.04,))
     return list(map(str, run_study(extent, folder)))
 

@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
     world_file,
 )
-from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.run_record import RATE, Record
 
 BENCH = Path(__file__).parents[2] / 'bench'
 

@@ -16,7 +16,7 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
+from t3mpc_ros.chaos.system_equations import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 
 ORDINARY = (1.0, 1.0, 1.0, 1.0)

@@ -18,8 +18,8 @@ from support.bag_messages import diagnostics
 from support.robot_bags import following_rows, write
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
 
 
 def change(second, number, *, kind='new', first=4.5, last=6.0, **state):

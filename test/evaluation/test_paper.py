@@ -25,10 +25,10 @@ import numpy as np
 import pytest
 from support.records import record_of
 
-from t3mpc_ros.evaluation import experiment, plotting
+from t3mpc_ros.evaluation import experiment, figure_style
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import FULL, methods
-from t3mpc_ros.evaluation.paper import study
+from t3mpc_ros.evaluation.method_table import FULL, methods
+from t3mpc_ros.evaluation.paper import paper_study
 from t3mpc_ros.evaluation.paper.claims import (
     ALONE,
     INTENDED,
@@ -41,8 +41,8 @@ from t3mpc_ros.evaluation.paper.figure_runs import explained, follows_claim, swi
 from t3mpc_ros.evaluation.paper.paper_figures import floor_path, largest_switch
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables
 from t3mpc_ros.evaluation.paper.reproduce import EXHIBITS, RUNS, counted, reproduce
-from t3mpc_ros.evaluation.record import switch_times
-from t3mpc_ros.evaluation.reporting import finite
+from t3mpc_ros.evaluation.result_formats import finite
+from t3mpc_ros.evaluation.run_record import switch_times
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
@@ -63,8 +63,8 @@ def fake_run(scenario, method):
     phases = generator.uniform(0.0, 6.0, 2)
     reference = 4.0 * np.sin(0.8 * time[:, np.newaxis] + phases + 2.0 * modes[:, np.newaxis])
     size = 0.9 if method.baseline else 0.3
-    if method.name in study.STAGES:
-        size = 0.5 - 0.08 * study.STAGES.index(method.name)
+    if method.name in paper_study.STAGES:
+        size = 0.5 - 0.08 * paper_study.STAGES.index(method.name)
     run['mode'][:] = modes
     run.reference[:] = reference
     size *= 1.0 + scenario.noise
@@ -85,28 +85,28 @@ def record(duration, method=FULL):
 
 def situations(extent):
     names = ('controller', 'drive', 'noise', 'case', 'seed')
-    return [tuple(run.fields[name] for name in names) for run in study.study_runs(extent)]
+    return [tuple(run.fields[name] for name in names) for run in paper_study.study_runs(extent)]
 
 
 def test_the_full_study_has_each_run_once_the_quick_one_some(monkeypatch):
-    monkeypatch.setattr(study, 'digest', lambda *_: '')  # keys of thousands of runs
-    full, quick = study.chosen_extent(), study.chosen_extent(quick=True)
+    monkeypatch.setattr(paper_study, 'digest', lambda *_: '')  # keys of thousands of runs
+    full, quick = paper_study.chosen_extent(), paper_study.chosen_extent(quick=True)
     every = situations(full)
     assert len(every) == len({*every})
     assert {each[-1] for each in every} == {*HELD_OUT_SEEDS}
     wanted = [each[:-1] for each in every if each[-1] == 101]
     assert {name for name, *_ in wanted} == {*METHODS}
-    for drive in study.DRIVES:
+    for drive in paper_study.DRIVES:
         cases = [case for case in full.cases if (drive, case) != ('torque', 'dead time')]
         for name, method in METHODS.items():
             found = {
                 (noise, case) for each, at, noise, case in wanted if (each, at) == (name, drive)
             }
-            expected = {(noise, 'nominal') for noise in study.NOISES}
-            if name in study.STAGES:
+            expected = {(noise, 'nominal') for noise in paper_study.NOISES}
+            if name in paper_study.STAGES:
                 expected |= {(noise, case) for noise in (0.0, 0.04) for case in cases}
-            elif name in study.WITHOUT.values():
-                intended = {'nominal', *study.INTENDED_CASES.get(name, ())}
+            elif name in paper_study.WITHOUT.values():
+                intended = {'nominal', *paper_study.INTENDED_CASES.get(name, ())}
                 expected = {(0.04, case) for case in intended.intersection(cases)}
             elif method.preview:
                 expected |= {(0.04, 'mass +30 %'), (0.04, 'mass -30 %')}
@@ -121,23 +121,23 @@ def test_the_full_study_has_each_run_once_the_quick_one_some(monkeypatch):
 @pytest.mark.parametrize('seeds', [(9,), (120, 121)])
 def test_seeds_that_are_not_held_out_cannot_be_asked_for(seeds):
     with pytest.raises(ValueError, match='seeds must be of 101-120'):
-        study.chosen_extent(seeds=seeds)
+        paper_study.chosen_extent(seeds=seeds)
 
 
 def test_runs_have_keys_of_their_own_and_of_their_method(monkeypatch):
     few = {name: METHODS[name] for name in (FULL, 'ADRC')}
-    monkeypatch.setattr(study, 'methods', lambda drive: few)
-    small = study.Extent((101, 102), 6.0, ('nominal', 'dead time'), (0.0, 0.04))
-    before = study.study_runs(small)
-    longer = study.study_runs(replace(small, duration=7.0))
+    monkeypatch.setattr(paper_study, 'methods', lambda drive: few)
+    small = paper_study.Extent((101, 102), 6.0, ('nominal', 'dead time'), (0.0, 0.04))
+    before = paper_study.study_runs(small)
+    longer = paper_study.study_runs(replace(small, duration=7.0))
     assert len({run.key for run in before + longer}) == 2 * len(before)
     gain = METHODS['ADRC'].parameters.with_values({'gain': 7.0})
     few['ADRC'] = replace(METHODS['ADRC'], parameters=gain)
-    after = study.study_runs(small)
+    after = paper_study.study_runs(small)
     apart = [run for run, other in zip(after, before, strict=True) if run.key != other.key]
     assert {run.fields['controller'] for run in apart} == {'ADRC'}
-    monkeypatch.setattr(study, 'measure', lambda record: {})
-    assert not {run.key for run in study.study_runs(small)} & {run.key for run in before}
+    monkeypatch.setattr(paper_study, 'measure', lambda record: {})
+    assert not {run.key for run in paper_study.study_runs(small)} & {run.key for run in before}
 
 
 def test_what_is_measured_of_a_run():
@@ -147,7 +147,7 @@ def test_what_is_measured_of_a_run():
     run.speeds[1210] += 0.5  # within the second about the switch at 12 s
     run.speeds[1700, 1] -= 0.25
     counted = 2 * 1700
-    assert study.measure(run) == {
+    assert paper_study.measure(run) == {
         'rmse': pytest.approx(math.sqrt((2 * 0.25 + 0.0625) / counted)),
         'settled': pytest.approx(math.sqrt(0.0625 / (counted - 200))),
         'largest_error': pytest.approx(0.5),
@@ -159,9 +159,9 @@ def test_what_is_measured_of_a_run():
 def test_a_diverged_run_is_marked_as_not_finite():
     run = record(6.0)
     run['acceleration'][-1, 0] = math.inf
-    found = study.measure(run)
+    found = paper_study.measure(run)
     assert not found['finite']
-    assert all(math.isnan(found[name]) for name in study.NUMBERS)
+    assert all(math.isnan(found[name]) for name in paper_study.NUMBERS)
 
 
 # Results
@@ -191,13 +191,13 @@ def in_all(drive, noise, values, case='nominal'):
 
 
 def test_stage_differences_compare_measured_neighbours():
-    rmse = {name: 0.5 - 0.1 * k + 0.01 * np.arange(4) for k, name in enumerate(study.STAGES)}
+    rmse = {name: 0.5 - 0.1 * k + 0.01 * np.arange(4) for k, name in enumerate(paper_study.STAGES)}
     entries = in_all('torque', 0.04, rmse)
     entries['+MPC', 'torque', 0.04, 'friction x3'] = (0.4, 0.5)
     results = Results(table_of(entries, few=True))
     assert [(pair['first'], pair['second'], pair['case']) for pair in results.added] == [
         (more, less, 'nominal')
-        for more, less in zip(study.STAGES[1:], study.STAGES[:-1], strict=True)
+        for more, less in zip(paper_study.STAGES[1:], paper_study.STAGES[:-1], strict=True)
     ]
     # What all seeds share drops out: unpaired, the same two could not be told apart.
     for pair in results.added:
@@ -262,7 +262,7 @@ def test_baselines_with_preview_and_a_wrong_inertia():
 
 
 def test_noise_free_against_pi_with_feed_forward():
-    names = [f'noise-free against PI, {drive}' for drive in study.DRIVES]
+    names = [f'noise-free against PI, {drive}' for drive in paper_study.DRIVES]
     for pi, verdict in ((0.2, True), (0.1999, False)):
         entries = rmse_of('velocity', 0.0, full=0.2, pi=pi, fuzzy=0.01)
         assert held(entries, *names) == [None, verdict]
@@ -297,9 +297,9 @@ def test_limits_of_the_settled_error_and_of_chatter():
 
 @pytest.mark.parametrize('part, case, drives', INTENDED + ALONE)
 def test_a_part_helps_if_its_paired_interval_is_negative(part, case, drives):
-    pairs = {f'{part} is missed': (FULL, study.WITHOUT[part])}
-    if part in study.PARTS:
-        less, more = study.STAGES[study.PARTS.index(part) :][:2]
+    pairs = {f'{part} is missed': (FULL, paper_study.WITHOUT[part])}
+    if part in paper_study.PARTS:
+        less, more = paper_study.STAGES[paper_study.PARTS.index(part) :][:2]
         pairs[f'{part} lowers RMSE'] = more, less
     base = np.array((0.5, 0.7, 0.9, 1.1))
     for name, (more, less) in pairs.items():
@@ -363,9 +363,9 @@ def test_few_seeds_decide_only_what_their_interval_does(full, word):
 def test_one_seed_leaves_every_claim_inconclusive():
     """All situations with one seed: nothing is held, nothing is not held."""
     generator = np.random.default_rng(7)
-    runs = study.study_runs(study.chosen_extent(quick=True, seeds=(101,)))
+    runs = paper_study.study_runs(paper_study.chosen_extent(quick=True, seeds=(101,)))
     table = ResultTable(
-        [run.fields | dict(zip(study.NUMBERS, generator.uniform(0.01, 1.0, 4), strict=True))
+        [run.fields | dict(zip(paper_study.NUMBERS, generator.uniform(0.01, 1.0, 4), strict=True))
          for run in runs]
     )  # fmt: skip
     claims = all_claims(table, ResultTable([]))
@@ -444,9 +444,9 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, 'run', fake_run)
         # A picture takes long; test_figures.py renders one as SVG.
-        file_of, picture = plotting.file_of, {'svg': b'<svg/>'}
+        file_of, picture = figure_style.file_of, {'svg': b'<svg/>'}
         patch.setattr(
-            plotting, 'file_of', lambda each, kind: picture.get(kind) or file_of(each, kind)
+            figure_style, 'file_of', lambda each, kind: picture.get(kind) or file_of(each, kind)
         )
         reproduce(output, quick=True, seeds=(101, 102), estimation_seeds=(1,), fresh=True)
     return output

@@ -35,7 +35,7 @@ from support.other_parameters import with_other_value
 from support.robot_bags import write_with_records
 
 from t3mpc_ros.bag.columns import read_columns
-from t3mpc_ros.bag.controller_journal import (
+from t3mpc_ros.bag.controller_input_journal import (
     Event,
     Journal,
     parameters_from_json,
@@ -47,7 +47,7 @@ from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control import watchdog
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     SPEEDS,

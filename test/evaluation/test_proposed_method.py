@@ -25,11 +25,11 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import paired
-from t3mpc_ros.evaluation.drivers import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import methods
+from t3mpc_ros.evaluation.loop_drivers import MadeMethod, MethodSpec
+from t3mpc_ros.evaluation.method_table import methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
-from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario
 from t3mpc_ros.evaluation.tuning.tuned_parameter_file import StoreError, TunedParameters
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist

@@ -32,14 +32,14 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     compute_metrics,
     estimation_target,
 )
-from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
-from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
-from t3mpc_ros.evaluation.bag_report.run_comparison import _sentence
-from t3mpc_ros.evaluation.bag_report.run_data import (
+from t3mpc_ros.evaluation.bag_report.recorded_run import (
     BY_WHEEL,
     SIGNAL_NAMES,
     Series,
 )
+from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
+from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
+from t3mpc_ros.evaluation.bag_report.run_comparison import _sentence
 from t3mpc_ros.evaluation.bag_report.verdict import (
     KNOWN_PARAMETERS,
     KNOWN_RMSE,

@@ -491,7 +491,7 @@ def test_the_definitions_are_those_of_the_code():
     assert len(constants) > 15
     for name, value, module in constants:
         place = 'evaluation.bag_report'
-        if module in ('drive_response', 'record'):
+        if module in ('drive_response', 'run_record'):
             place = 'evaluation'
         found = getattr(import_module(f't3mpc_ros.{place}.{module}'), name)
         assert found == float(value), name

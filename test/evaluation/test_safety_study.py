@@ -21,7 +21,7 @@ import pytest
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import safety_study
 from t3mpc_ros.evaluation.patrol.patrol_run import START, FaultyRanges, SensorFault
-from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.simulation.world import parse_world
 

@@ -33,7 +33,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     FieldComparison,
     Tolerances,
 )
-from t3mpc_ros.evaluation.record import METRICS, START, measure
+from t3mpc_ros.evaluation.run_record import METRICS, START, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 

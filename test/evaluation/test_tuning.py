@@ -26,10 +26,10 @@ import pytest
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import ROBOTS
-from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import JobError
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
-from t3mpc_ros.evaluation.methods import (
+from t3mpc_ros.evaluation.loop_drivers import MethodSpec
+from t3mpc_ros.evaluation.method_table import (
     further_definitions,
     method_definitions,
     methods,
@@ -712,9 +712,9 @@ def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
         return _Instead()
 
     monkeypatch.setattr(tune_module, 'ClosedLoopObjective', instead)
-    tunable = 't3mpc_ros.evaluation.methods.method_definitions'
+    tunable = 't3mpc_ros.evaluation.method_table.method_definitions'
     monkeypatch.setattr(tunable, lambda: [FEEDBACK, WIDER])
-    monkeypatch.setattr('t3mpc_ros.evaluation.methods.further_definitions', list)
+    monkeypatch.setattr('t3mpc_ros.evaluation.method_table.further_definitions', list)
     path = tmp_path / 'tuned.json'
     line = ['tune', 'P-feedback', '--evaluations', '12', '--workers', '3', '--output', str(path)]
     assert main([*line, '--robot', 'servo']) == 0

@@ -22,9 +22,9 @@ import pytest
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegralParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import (
+from t3mpc_ros.evaluation.loop_drivers import NodeMethod
+from t3mpc_ros.evaluation.method_table import (
     EXACT_MODEL,
     FULL,
     LMS,
@@ -34,7 +34,7 @@ from t3mpc_ros.evaluation.methods import (
     method_definitions,
     methods_for,
 )
-from t3mpc_ros.evaluation.record import OVERALL, VARIATION, measure, rolling_speeds
+from t3mpc_ros.evaluation.run_record import OVERALL, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning import tune_methods as twin_tuning
 from t3mpc_ros.evaluation.tuning.tune_methods import (

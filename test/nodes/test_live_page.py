@@ -19,7 +19,7 @@ from support.browser import SIZES, Browser
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.view import PAGE_AT
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]

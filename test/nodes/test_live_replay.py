@@ -19,9 +19,9 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import ControllerHarness, diagnostic, odometry, reason
 
-from t3mpc_ros.bag.controller_journal import Event
+from t3mpc_ros.bag.controller_input_journal import Event
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.recorder_parameters import RecordingParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs

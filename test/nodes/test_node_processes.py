@@ -27,7 +27,7 @@ from support.ros_graph import speed, stamp
 from support.signals import attended
 from support.waiting import Processes, wait_until
 
-from t3mpc_ros.bag.controller_journal import Event
+from t3mpc_ros.bag.controller_input_journal import Event
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.cli.process_group import PrivateGraph
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs

@@ -17,7 +17,7 @@ import platform
 import subprocess
 
 import t3mpc_ros
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.version_and_commit import provenance
 
 
 def test_the_commit_says_whether_files_differ(tmp_path):

@@ -23,7 +23,7 @@ from support.long_tests import few_of
 from support.tool_bench import ToolBench
 
 from t3mpc_ros.cli import robot_doctor as cli
-from t3mpc_ros.evaluation.api.error_messages import sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import sentence
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import Pong, Samples

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
+from t3mpc_ros.chaos.system_equations import QuadraticSystem, Terms, right_hand_side
 from t3mpc_ros.fuzzy.inference import LOWER, UPPER, FuzzySets, fuzzify, square_distances
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds

@@ -26,7 +26,7 @@ import zlib
 
 import numpy as np
 
-from t3mpc_ros.bag.controller_journal import Journal
+from t3mpc_ros.bag.controller_input_journal import Journal
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
 from t3mpc_ros.evaluation.process_replay.controller_replay import output_row
@@ -39,7 +39,7 @@ from t3mpc_ros.evaluation.process_replay.replay_writer import (
     row_bytes,
     twist_bytes,
 )
-from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario, noisy_twin
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist

@@ -16,7 +16,7 @@
 import numpy as np
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.record import Record
+from t3mpc_ros.evaluation.run_record import Record
 
 PAIRS = ('reference', 'measured', 'speeds', 'sent', 'estimated', 'unexplained', 'acceleration')
 

@@ -19,8 +19,14 @@ import numpy as np
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report.link_metrics import LinkHistory
+from t3mpc_ros.evaluation.bag_report.recorded_run import (
+    BY_WHEEL,
+    SIGNAL_NAMES,
+    Run,
+    Series,
+    Timing,
+)
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
-from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL, SIGNAL_NAMES, Run, Series, Timing
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 

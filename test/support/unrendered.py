@@ -15,7 +15,7 @@
 
 import pytest
 
-from t3mpc_ros.evaluation import plotting
+from t3mpc_ros.evaluation import figure_style
 
 
 def draw_only(draw, subject):
@@ -26,5 +26,5 @@ def draw_only(draw, subject):
 @pytest.fixture
 def unrendered(monkeypatch):
     """Draw figures without rendering them."""
-    monkeypatch.setattr(plotting, 'drawing', draw_only)
-    monkeypatch.setattr(plotting, 'file_of', lambda figure, kind: kind.encode())
+    monkeypatch.setattr(figure_style, 'drawing', draw_only)
+    monkeypatch.setattr(figure_style, 'file_of', lambda figure, kind: kind.encode())

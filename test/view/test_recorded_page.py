@@ -25,7 +25,7 @@ from support.robot_bags import following_rows, write
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag_on_live_page import recorded_run
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.view.live_data import LiveData, LiveRun
 from t3mpc_ros.view.server import PageServer
 

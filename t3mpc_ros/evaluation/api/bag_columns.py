@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.geometry.types import NANOSECONDS, read_only
 from t3mpc_ros.parameters.table import nearest_hint
 from t3mpc_ros.script_error import ScriptError

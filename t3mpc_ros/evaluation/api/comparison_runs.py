@@ -24,19 +24,19 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import comparison
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn, writable
-from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
+from t3mpc_ros.evaluation.api.script_inputs import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
-from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric
 from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.reporting import columns_of
+from t3mpc_ros.evaluation.result_formats import columns_of
+from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.parameters.version_and_commit import machine, provenance
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_schedule import FaultSchedule
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables, build_sets, evaluate_basis
 from t3mpc_ros.geometry.types import Array

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only
 from t3mpc_ros.script_error import ScriptError
 

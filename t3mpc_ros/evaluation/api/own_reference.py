@@ -26,9 +26,9 @@ import numpy as np
 from numpy.exceptions import ComplexWarning
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
-from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
 from t3mpc_ros.geometry.types import Array

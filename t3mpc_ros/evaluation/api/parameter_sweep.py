@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api import comparison_runs, result_tables
-from t3mpc_ros.evaluation.api.error_messages import one_sentence, sentence
 from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
-from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence, sentence
+from t3mpc_ros.evaluation.api.script_inputs import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
@@ -41,13 +41,13 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.reporting import columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
+from t3mpc_ros.evaluation.result_formats import columns_of
 from t3mpc_ros.evaluation.run_key import digest
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.parameters.version_and_commit import provenance
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_schedule import FaultSchedule
 

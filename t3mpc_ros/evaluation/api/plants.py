@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from t3mpc_ros.control.velocity_command import LimitParameters
-from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.mpc.pretraining import matrix_exponential

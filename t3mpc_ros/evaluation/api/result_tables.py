@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.reporting import write_columns
+from t3mpc_ros.evaluation.result_formats import write_columns
 from t3mpc_ros.parameters.command_line import check_writable
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.version_and_commit import provenance
 from t3mpc_ros.script_error import ScriptError
 
 PARQUET = '.parquet'
@@ -167,13 +167,13 @@ def drawn(draw: Callable[[Any], Any], path: str | os.PathLike[str] | None) -> An
     """Return what ``draw`` makes by the module of the figures, written to ``path`` if given."""
     import matplotlib
 
-    from t3mpc_ros.evaluation import plotting  # it loads matplotlib, which a run does without
+    from t3mpc_ros.evaluation import figure_style  # it loads matplotlib, which a run does without
 
-    with matplotlib.rc_context(plotting.STYLE):
-        figure = draw(plotting)
+    with matplotlib.rc_context(figure_style.STYLE):
+        figure = draw(figure_style)
     if path is not None:
-        target = writable(path, *(f'.{kind}' for kind in plotting.DATES))
-        write_atomically(target, plotting.file_of(figure, target.suffix.removeprefix('.')))
+        target = writable(path, *(f'.{kind}' for kind in figure_style.DATES))
+        write_atomically(target, figure_style.file_of(figure, target.suffix.removeprefix('.')))
     return figure
 
 

@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
+from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn
-from t3mpc_ros.evaluation.api.script_parts import as_controllers, own_scenario
+from t3mpc_ros.evaluation.api.script_inputs import as_controllers, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.record import METRICS, START, Numbers, Record, measure, some_rows
 from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.run_record import METRICS, START, Numbers, Record, measure, some_rows
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import find_names, nearest_hint

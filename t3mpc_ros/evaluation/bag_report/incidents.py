@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.continuity import MIN_GAP, gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
-from t3mpc_ros.evaluation.record import spans_of
+from t3mpc_ros.evaluation.bag_report.motion_continuity import MIN_GAP, gaps, pose_jumps
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series, moves
+from t3mpc_ros.evaluation.run_record import spans_of
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 

@@ -21,15 +21,15 @@ from pathlib import Path
 import numpy as np
 
 from t3mpc_ros.evaluation.bag_report import tracking_errors
-from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
 from t3mpc_ros.evaluation.bag_report.link_metrics import LinkMetrics, link_metrics
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
-from t3mpc_ros.evaluation.record import ON_PATH
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.run_record import ON_PATH
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 

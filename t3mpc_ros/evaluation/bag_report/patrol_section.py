@@ -18,8 +18,8 @@ import math
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.continuity import gaps
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import on_reference_frame
 from t3mpc_ros.evaluation.charts import Chart, Line
 from t3mpc_ros.evaluation.html_page import Block, Heading, Paragraph

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import tracking_errors
-from t3mpc_ros.evaluation.bag_report.continuity import gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
@@ -33,11 +32,12 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     latencies,
     path_of,
 )
+from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
-from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
+from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline

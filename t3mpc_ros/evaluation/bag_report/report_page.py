@@ -33,8 +33,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     compute_metrics,
 )
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, load_run
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS, Section, undetermined
-from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import errors_of
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
@@ -51,9 +51,9 @@ from t3mpc_ros.evaluation.html_page import (
     VerdictBox,
     html_page,
 )
-from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from, spans_of
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.run_record import ROBOT_WINDOW, START, counted_from, spans_of
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,

@@ -33,8 +33,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     ReportMetrics,
     compute_metrics,
 )
+from t3mpc_ros.evaluation.bag_report.recorded_run import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
-from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven_and_settled,
     path_distance,
@@ -53,7 +53,7 @@ from t3mpc_ros.evaluation.html_page import (
     html_page,
 )
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     REFERENCE,

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report import incidents
-from t3mpc_ros.evaluation.bag_report.continuity import gaps
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.record import ROBOT_WINDOW, counted_from, counted_rows
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.run_record import ROBOT_WINDOW, counted_from, counted_rows
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 

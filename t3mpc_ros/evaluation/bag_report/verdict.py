@@ -32,15 +32,15 @@ from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
     cause_of,
 )
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
-from t3mpc_ros.evaluation.bag_report.run_data import Run
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     format_pair,
     path_distance,
     settled_rmse,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.record import ON_PATH, counted_from
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.run_record import ON_PATH, counted_from
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters

@@ -31,11 +31,11 @@ import numpy as np
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference, mean, paired
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL
+from t3mpc_ros.evaluation.method_table import EXACT_MODEL, FULL
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS
-from t3mpc_ros.evaluation.paper import study
+from t3mpc_ros.evaluation.paper import paper_study
 from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.reporting import format_number
+from t3mpc_ros.evaluation.result_formats import format_number
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
 from t3mpc_ros.geometry.types import Array
 
@@ -49,9 +49,9 @@ LOUDEST = 0.1
 ESTIMATION_SEEDS = 20
 """Seeds of the comparison (86) that the claims are about."""
 INTENDED = (
-    ('NT3FS', 'mass +30 %', study.DRIVES),
-    ('NT3FS', 'friction x3', study.DRIVES),
-    ('compensator', 'disturbance', study.DRIVES),
+    ('NT3FS', 'mass +30 %', paper_study.DRIVES),
+    ('NT3FS', 'friction x3', paper_study.DRIVES),
+    ('compensator', 'disturbance', paper_study.DRIVES),
     ('MPC', 'dead time', ('velocity',)),
     ('preview', NOMINAL, ('velocity',)),
 )
@@ -114,7 +114,7 @@ Query = Callable[..., Finding]
 def all_claims(runs: ResultTable, estimated: ResultTable) -> list[Claim]:
     """Return all claims with their verdicts: of this package, then of the paper."""
     complete = {*runs.unique('seed')} >= {*HELD_OUT_SEEDS}
-    complete &= all(duration >= study.DURATION for duration in runs.unique('duration'))
+    complete &= all(duration >= paper_study.DURATION for duration in runs.unique('duration'))
     found = [_decided(*each, runs, complete=complete) for each in definitions()]
     complete &= len(estimated.unique('seed')) >= ESTIMATION_SEEDS
     return found + [_decided(*each, estimated, complete=complete) for each in OF_ESTIMATION]
@@ -141,7 +141,7 @@ def _decided(claim: Claim, query: Query, runs: ResultTable, *, complete: bool) -
 def definitions() -> Iterator[tuple[Claim, Query]]:
     """Yield the claims about the runs of the study, each with what decides it."""
     ours, paper = partial(_of_drives, 'ours'), partial(_of_drives, 'paper')
-    for noise, limit in ((study.PAPER_NOISE, 0.60), (0.0, 0.50)):
+    for noise, limit in ((paper_study.PAPER_NOISE, 0.60), (0.0, 0.50)):
         yield from ours(
             f'share of the best baseline without preview, {{drive}}, noise {noise:g}',
             f'RMSE at most {limit:.2f} of that of the best baseline without preview ({{drive}} '
@@ -153,32 +153,33 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
         'baselines with preview, wrong inertia in their models, {drive}',
         'RMSE no larger than that of any predictive baseline with preview whose model is 30 % off '
         'in its inertia, or within the paired interval ({drive} drive, noise '
-        f'{study.PAPER_NOISE:g})',
+        f'{paper_study.PAPER_NOISE:g})',
         partial(against_preview, cases=(NOMINAL,), exact=False),
     )
     yield from ours(
         'baselines with preview, wrong inertia of the robot, {drive}',
         'RMSE no larger than that of any predictive baseline with preview and the nominal model '
         'when mass and inertia of the robot are 30 % more or less ({drive} drive, noise '
-        f'{study.PAPER_NOISE:g})',
+        f'{paper_study.PAPER_NOISE:g})',
         partial(against_preview, cases=WRONG_INERTIA, exact=True),
     )
     for part, case, drives in INTENDED:
-        less, more = study.STAGES[study.PARTS.index(part) :][:2]
+        less, more = paper_study.STAGES[paper_study.PARTS.index(part) :][:2]
         yield from ours(
             f'{part} lowers RMSE, {case}, {{drive}}',
             f'Adding {part} lowers RMSE in the case {case} ({{drive}} drive, noise '
-            f'{study.PAPER_NOISE:g}; {more} less {less}, same seeds, 95 % interval below zero)',
+            f'{paper_study.PAPER_NOISE:g}; {more} less {less}, same seeds, 95 % interval below '
+            'zero)',
             partial(lowers_rmse, first=more, second=less, case=case),
             drives,
         )
     for part, case, drives in INTENDED + ALONE:
-        less = study.WITHOUT[part]
+        less = paper_study.WITHOUT[part]
         yield from ours(
             f'{part} is missed, {case}, {{drive}}',
             f'Leaving {part} out of the full controller costs RMSE in the case {case} ({{drive}} '
-            f'drive, noise {study.PAPER_NOISE:g}; {FULL} less {less}, same seeds, interval below '
-            'zero)',
+            f'drive, noise {paper_study.PAPER_NOISE:g}; {FULL} less {less}, same seeds, interval '
+            'below zero)',
             partial(lowers_rmse, first=FULL, second=less, case=case),
             drives,
         )
@@ -200,10 +201,10 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
         partial(settled_share, limit=0.02 * REFERENCE_SPREAD),
     )
     yield from paper(
-        f'half of the best baseline, {{drive}}, noise {study.PAPER_NOISE:g}',
+        f'half of the best baseline, {{drive}}, noise {paper_study.PAPER_NOISE:g}',
         'About 50 % more accurate than other methods: RMSE at most 0.50 of that of the best '
-        f'baseline ({{drive}} drive, nominal, noise {study.PAPER_NOISE:g})',
-        partial(share_of_best, noise=study.PAPER_NOISE, limit=0.50),
+        f'baseline ({{drive}} drive, nominal, noise {paper_study.PAPER_NOISE:g})',
+        partial(share_of_best, noise=paper_study.PAPER_NOISE, limit=0.50),
     )
     yield from paper(
         'grows only slightly, {drive}',
@@ -221,13 +222,13 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
         'no chatter, {drive}',
         'Control signals without high-frequency fluctuation (here: total variation of what is '
         'asked of the robot no more than the median of the baselines; {drive} drive, nominal, '
-        f'noise {study.PAPER_NOISE:g})',
+        f'noise {paper_study.PAPER_NOISE:g})',
         calm_control,
     )
 
 
 def _of_drives(
-    origin: str, name: str, text: str, query: Query, drives: Sequence[str] = study.DRIVES
+    origin: str, name: str, text: str, query: Query, drives: Sequence[str] = paper_study.DRIVES
 ) -> Iterator[tuple[Claim, Query]]:
     """Yield a claim for each drive; name and text have its name in place of ``{drive}``."""
     for drive in drives:
@@ -257,8 +258,8 @@ def against_preview(
     held, words, margins = True, [], []
     numbers: dict[str, object] = {}
     for case in cases:
-        full = by_seed(runs, FULL, drive, study.PAPER_NOISE, case)
-        others = baselines(runs, drive, study.PAPER_NOISE, case, exact=exact, preview=True)
+        full = by_seed(runs, FULL, drive, paper_study.PAPER_NOISE, case)
+        others = baselines(runs, drive, paper_study.PAPER_NOISE, case, exact=exact, preview=True)
         best = best_of(others)
         own, least = mean(full), mean(others[best])
         margins.append(margin := paired(others[best], full))
@@ -271,8 +272,8 @@ def against_preview(
 
 def lowers_rmse(runs: ResultTable, first: str, second: str, drive: str, case: str) -> Finding:
     """Compare two methods on the same seeds: the whole interval is below zero."""
-    lower = by_seed(runs, first, drive, study.PAPER_NOISE, case)
-    higher = by_seed(runs, second, drive, study.PAPER_NOISE, case)
+    lower = by_seed(runs, first, drive, paper_study.PAPER_NOISE, case)
+    higher = by_seed(runs, second, drive, paper_study.PAPER_NOISE, case)
     margin = paired(higher, lower)
     difference, ci95 = paired(lower, higher)
     seeds = len(lower)
@@ -342,8 +343,8 @@ def others_grow(runs: ResultTable, drive: str) -> Finding:
 
 def calm_control(runs: ResultTable, drive: str) -> Finding:
     """Compare the total variation of the effort with that of the median baseline."""
-    full = by_seed(runs, FULL, drive, study.PAPER_NOISE, column='chatter')
-    found = baselines(runs, drive, study.PAPER_NOISE, column='chatter')
+    full = by_seed(runs, FULL, drive, paper_study.PAPER_NOISE, column='chatter')
+    found = baselines(runs, drive, paper_study.PAPER_NOISE, column='chatter')
     others = {name: each for name, each in found.items() if math.isfinite(mean(each))}
     if not others:
         raise NotMeasuredError
@@ -455,7 +456,7 @@ def _rmse(value: float) -> str:
 
 def half_of_others(estimated: ResultTable) -> Finding:
     """Compare type 3 at the paper's noise with half of the best of the others."""
-    speeds = _speeds(estimated, study.PAPER_NOISE)
+    speeds = _speeds(estimated, paper_study.PAPER_NOISE)
     ours, *others = KINDS
     best = best_of({kind: speeds[kind] for kind in others})
     own, other = mean(speeds[ours]), mean(speeds[best])
@@ -492,7 +493,7 @@ OF_ESTIMATION: Sequence[tuple[Claim, Query]] = (
             'estimation, half of the others',
             'paper',
             'Without a controller (86), type 3 estimates the speeds about 50 % better than type 1 '
-            f'and type 2 (RMSE at most half of the best, noise {study.PAPER_NOISE:g})',
+            f'and type 2 (RMSE at most half of the best, noise {paper_study.PAPER_NOISE:g})',
         ),
         half_of_others,
     ),

@@ -24,7 +24,7 @@ from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.experiment import map_jobs, recorded_run
-from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NORMALISED_GAIN,
@@ -35,9 +35,9 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     torque_robot,
 )
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
+from t3mpc_ros.evaluation.paper.paper_study import PAPER_NOISE, SETTLING, WITHOUT, Extent
 from t3mpc_ros.evaluation.paper.paper_tables import Results, rank
-from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, SETTLING, WITHOUT, Extent
-from t3mpc_ros.evaluation.record import START, Record, switch_times
+from t3mpc_ros.evaluation.run_record import START, Record, switch_times
 from t3mpc_ros.evaluation.scenario import PLANT_OF, Scenario
 from t3mpc_ros.geometry.types import Array
 

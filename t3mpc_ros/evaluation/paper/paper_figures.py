@@ -23,20 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation import plotting
+from t3mpc_ros.evaluation import figure_style
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.method_table import FULL
 from t3mpc_ros.evaluation.paper.figure_runs import (
     FigureRuns,
     estimated_unknown,
     explained,
     true_unknown,
 )
+from t3mpc_ros.evaluation.paper.paper_study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
 from t3mpc_ros.evaluation.paper.paper_tables import Results, label
-from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
-from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.run_record import START, Record, switch_times
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, Array, WheelSpeeds
@@ -65,24 +65,24 @@ def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:
 
 # -- figures --------------------------------------------------------------------------------------
 
-REFERENCE_COLOUR, DRIVEN = plotting.COLOURS[REFERENCE], plotting.COLOURS[TRUTH]
-COMMAND, MEASURED = plotting.COLOURS['applied'], plotting.COLOURS[ODOMETRY]
+REFERENCE_COLOUR, DRIVEN = figure_style.COLOURS[REFERENCE], figure_style.COLOURS[TRUTH]
+COMMAND, MEASURED = figure_style.COLOURS['applied'], figure_style.COLOURS[ODOMETRY]
 
 
 def path(showcase: FigureRuns) -> Any:
     """Return the path on the floor of the simulated robot, the paper's Fig. 8."""
     run = showcase.velocity
-    figure = plotting.new_figure(5.0)
+    figure = figure_style.new_figure(5.0)
     axis = figure.subplots()
     reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
     axis.plot(*reference.T, color=REFERENCE_COLOUR, linewidth=1.0, label='reference')
     axis.plot(*driven.T, color=DRIVEN, linewidth=1.6, label='driven')
     axis.plot(*driven[0], 'o', color=REFERENCE_COLOUR, markersize=6, label='start')
     at = driven[1:][np.diff(run['mode']) != 0]
-    axis.plot(*at.T, 'D', color=plotting.COLOURS['switch'], markersize=5, label='switch')
+    axis.plot(*at.T, 'D', color=figure_style.COLOURS['switch'], markersize=5, label='switch')
     axis.set_aspect('equal', adjustable='datalim')
     axis.set(xlabel='x / m', ylabel='y / m')
-    plotting.legend_above(figure, axis)
+    figure_style.legend_above(figure, axis)
     return figure
 
 
@@ -124,7 +124,7 @@ def portrait_in_words(showcase: FigureRuns) -> str:
 
 def portrait(run: Record) -> Any:
     """Return the phase portrait of the wheels and of their reference, Fig. 9 and 14."""
-    figure = plotting.new_figure(3.4)
+    figure = figure_style.new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     # The robot's way through a switch is part of its portrait, the reference's jump is not.
     reference = broken_at_switches(run, run.reference)
@@ -141,7 +141,7 @@ def portrait(run: Record) -> Any:
 def modes(showcase: FigureRuns) -> Any:
     """Return which chaotic signal drives which output, the paper's Fig. 10."""
     run = showcase.torque
-    figure, axes = plotting.new_panels(2, 1.25)
+    figure, axes = figure_style.new_panels(2, 1.25)
     index = run['mode'].astype(int) % len(showcase.pairs)
     signals = np.array(showcase.pairs)[index]
     end = run.time[-1] + run.time[1] - run.time[0]
@@ -167,7 +167,7 @@ def outputs(showcase: FigureRuns) -> Any:
     columns = ((run.reference, reference), (run.speeds, driven))
     samples = run['measured'], dots
     figure, axes = run_and_zoom(run, 'speed / rad/s', 0.4, 1.6, columns, samples)
-    plotting.legend_above(figure, axes[0][-1])
+    figure_style.legend_above(figure, axes[0][-1])
     return figure
 
 
@@ -186,13 +186,17 @@ def control(showcase: FigureRuns) -> Any:
 def estimates(showcase: FigureRuns) -> Any:
     """Return the estimates g with their targets, the paper's Fig. 13."""
     run = showcase.torque
-    target = {'color': plotting.COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
-    found = {'color': plotting.COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
+    target = {
+        'color': figure_style.COLOURS['target'],
+        'lw': 0.9,
+        'label': 'unknown, $\\dot\\chi - u$',
+    }
+    found = {'color': figure_style.COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
     columns = ((true_unknown(run), target), (estimated_unknown(run)[:-1], found))
     figure, axes = run_and_zoom(run, 'rad/s²', 2.0, 4.0, columns)
     for axis, wheel, share in zip(axes[:, 0], WHEELS, explained(run), strict=True):
         axis.set_title(f'{wheel} wheel, {100 * share:.0f} % of the variance explained')
-    plotting.legend_above(figure, axes[0][-1])
+    figure_style.legend_above(figure, axes[0][-1])
     return figure
 
 
@@ -205,9 +209,11 @@ def preview(showcase: FigureRuns) -> Any:
     before, after = 0.3, 0.8
     rows = rows_between(run, run.time[middle] - before, run.time[middle] + after)
     time = run.time[rows] - run.time[middle]
-    figure, axes = plotting.new_panels(2, 2.1)
+    figure, axes = figure_style.new_panels(2, 2.1)
     for axis, i in zip(axes, range(2), strict=True):
-        axis.axvline(0.0, color=plotting.COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
+        axis.axvline(
+            0.0, color=figure_style.COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3))
+        )
         reference = {'color': REFERENCE_COLOUR, 'lw': 1.0, 'label': 'reference'}
         axis.step(time, run.reference[rows, i], where='post', **reference)
         axis.plot(time, run.speeds[rows, i], color=DRIVEN, lw=1.6, label='with preview')
@@ -215,7 +221,7 @@ def preview(showcase: FigureRuns) -> Any:
         axis.set(title=f'{WHEELS[i]} wheel', ylabel='speed / rad/s')
         axis.margins(x=0.0)
     axes[-1].set_xlabel(f'time from the switch at {run.time[middle]:.0f} s / s')
-    plotting.legend_above(figure, axes[0])
+    figure_style.legend_above(figure, axes[0])
     return figure
 
 
@@ -240,13 +246,13 @@ def run_and_zoom(
     if middle is not None:
         switch = run.time[middle]
         stretches.append(rows_between(run, switch - before, switch + after))
-    figure = plotting.new_figure(4.6)
+    figure = figure_style.new_figure(4.6)
     ratios = {'width_ratios': (1.7, 1.0)[: len(stretches)]}
     axes = figure.subplots(2, len(stretches), sharex='col', squeeze=False, gridspec_kw=ratios)
     for i, wheel in enumerate(WHEELS):
         axes[i, 0].set(title=f'{wheel} wheel', ylabel=unit)
         for k, (axis, rows) in enumerate(zip(axes[i], stretches, strict=True)):
-            plotting.mark_switches(axis, switch_times(run.time, run['mode']))
+            figure_style.mark_switches(axis, switch_times(run.time, run['mode']))
             for values, style in (samples, *columns) if samples and k else columns:
                 shown = rows[rows < len(values)]
                 axis.plot(*thinned(run.time[shown], values[shown, i]), **style)
@@ -298,7 +304,7 @@ def rmse_bars(results: Results) -> Any:
         shown[drive] = sorted(rows, key=lambda row: float(row['rmse_mean']))
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
-    figure = plotting.new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
+    figure = figure_style.new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
     axes = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for axis, (drive, rows) in zip(axes, shown.items(), strict=True):
         places = np.arange(len(rows))
@@ -325,7 +331,7 @@ def noise_growth(results: Results) -> Any:
         return None
     colours = colours_of(results)
     baselines = results.means.unique('controller', baseline=True)
-    figure = plotting.new_figure(5.6 + 0.16 * len(baselines) / 3)
+    figure = figure_style.new_figure(5.6 + 0.16 * len(baselines) / 3)
     drives = results.drives
     axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
     for column, drive in zip(axes.T, drives, strict=True):
@@ -353,14 +359,14 @@ def noise_growth(results: Results) -> Any:
     axes[0, 0].set_ylim(bottom=0.0)  # not before every line is there: it fixes the top, too
     axes[0, 0].set_ylabel('RMSE / rad/s')
     axes[1, 0].set_ylabel('RMSE less that without noise / rad/s')
-    plotting.legend_above(figure, *axes[0], columns=3)
+    figure_style.legend_above(figure, *axes[0], columns=3)
     return figure
 
 
 def ablation_bars(results: Results) -> Any:
     """Return the RMSE of the controller's stages in every case at the paper's noise."""
     drives = results.drives
-    figure = plotting.new_figure(0.6 + 2.3 * len(drives))
+    figure = figure_style.new_figure(0.6 + 2.3 * len(drives))
     panels = figure.subplots(len(drives), 1, squeeze=False)[:, 0]
     width = 0.85 / len(STAGES)
     for axis, drive in zip(panels, drives, strict=True):
@@ -378,7 +384,7 @@ def ablation_bars(results: Results) -> Any:
         axis.set_axisbelow(True)
         axis.set_ylim(bottom=0.0)
         axis.set(title=f'{drive} drive, noise {PAPER_NOISE:g}', ylabel='RMSE / rad/s')
-    plotting.legend_above(figure, panels[0])
+    figure_style.legend_above(figure, panels[0])
     return figure
 
 
@@ -386,7 +392,7 @@ def parts(results: Results) -> Any:
     """Return the effect of adding and of leaving out each part, with 95 % intervals."""
     drives = results.drives
     most = max(len(results.cases(drive)) for drive in drives)
-    figure = plotting.new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
+    figure = figure_style.new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
     axes = figure.subplots(len(drives), len(PARTS), squeeze=False, sharey='row')
     for row, drive in zip(axes, drives, strict=True):
         cases = results.cases(drive)
@@ -404,7 +410,7 @@ def parts(results: Results) -> Any:
                     axis.errorbar(
                         [sign * pair['difference'] for pair in pairs],
                         [cases.index(pair['case']) + beside for pair in pairs],
-                        xerr=[plotting.whisker(pair['ci95']) for pair in pairs],
+                        xerr=[figure_style.whisker(pair['ci95']) for pair in pairs],
                         fmt='o', markersize=4, elinewidth=1.4, label=words, color=colour,
                         markerfacecolor=face,
                     )  # fmt: skip
@@ -415,7 +421,7 @@ def parts(results: Results) -> Any:
         row[0].set_ylim(len(cases) - 0.5, -0.5)
         row[0].set_ylabel(f'{drive} drive')
     figure.supxlabel('paired difference of RMSE / rad/s; left of zero: better with it', fontsize=9)
-    plotting.legend_above(figure, axes[0, 0])
+    figure_style.legend_above(figure, axes[0, 0])
     return figure
 
 
@@ -425,7 +431,7 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
     shown = showcase.portraits
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = plotting.new_figure(0.6 + 2.2 * rows)
+    figure = figure_style.new_figure(0.6 + 2.2 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axis in axes.flat[len(shown) :]:
         axis.set_visible(False)
@@ -444,10 +450,10 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
 def estimation_portraits(showcase: FigureRuns) -> Any:
     """Return phase portraits of (86) by kind of fuzzy system, the paper's Fig. 15."""
     shown = showcase.estimated
-    figure = plotting.new_figure(2.7)
+    figure = figure_style.new_figure(2.7)
     axes = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)
     true = showcase.driven
-    palette = (OURS, plotting.COLOURS['estimate'], plotting.COLOURS['feedforward'])
+    palette = (OURS, figure_style.COLOURS['estimate'], figure_style.COLOURS['feedforward'])
     for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):
         miss = rms(found - true)
         axis.plot(found[:, 1], found[:, 0], color=colour, linewidth=0.7, label='estimated')
@@ -466,4 +472,6 @@ def _name_wheels(axes: Any) -> None:
 
 def _bars(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
     """Return the RMSE of rows and the lengths of their whiskers."""
-    return [row['rmse_mean'] for row in rows], [plotting.whisker(row['rmse_ci95']) for row in rows]
+    return [row['rmse_mean'] for row in rows], [
+        figure_style.whisker(row['rmse_ci95']) for row in rows
+    ]

@@ -20,15 +20,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation import html_page, open_loop_estimation, report_table, reporting
+from t3mpc_ros.evaluation import html_page, open_loop_estimation, report_table, result_formats
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
-from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
-from t3mpc_ros.evaluation.paper import figure_runs, paper_figures, study
+from t3mpc_ros.evaluation.figure_style import write_pictures
+from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
+from t3mpc_ros.evaluation.paper import figure_runs, paper_figures, paper_study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
-from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.run_key import source_digest
-from t3mpc_ros.parameters.provenance import machine, provenance
+from t3mpc_ros.parameters.version_and_commit import machine, provenance
 from t3mpc_ros.version import VERSION
 
 RUNS = 'runs.jsonl'
@@ -56,7 +56,7 @@ def reproduce(
     ``estimation_seeds`` the same of the comparison (86).
     """
     write = report or (lambda text: None)
-    extent = study.chosen_extent(quick=quick, seeds=seeds)
+    extent = paper_study.chosen_extent(quick=quick, seeds=seeds)
     results = Results(run_study(extent, output, workers, fresh=fresh, report=report))
     write('  runs for the figures')
     showcase = figure_runs.simulate_figure_runs(extent, results, workers)
@@ -84,7 +84,7 @@ def reproduce(
             'estimation_noises': list(variances),
             'methods': {
                 drive: {name: asdict(each.parameters) for name, each in methods(drive).items()}
-                for drive in study.DRIVES
+                for drive in paper_study.DRIVES
             },
             'sources': source_digest(),
         },
@@ -96,12 +96,12 @@ def reproduce(
         'claims': [claim.record() for claim in claims],
     }
     output.mkdir(parents=True, exist_ok=True)
-    (output / 'results.json').write_text(reporting.strict_json(content), encoding='utf-8')
+    (output / 'results.json').write_text(result_formats.strict_json(content), encoding='utf-8')
     origin = provenance() | machine()
-    reporting.write_columns(
+    result_formats.write_columns(
         output / 'runs.csv', csv_columns([row | origin for row in results.runs])
     )
-    reporting.write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
+    result_formats.write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     drawn = write_pictures(
         {each.stem: each.draw for each in EXHIBITS if each.draw}, material, output / 'figures'
@@ -113,7 +113,7 @@ def reproduce(
 
 
 def run_study(
-    extent: study.Extent,
+    extent: paper_study.Extent,
     output: Path,
     workers: int | Executor = 1,
     *,
@@ -122,8 +122,8 @@ def run_study(
 ) -> ResultTable:
     """Return the runs of the study; those that the folder of the output holds are not repeated."""
     return run_experiment(
-        study.study_runs(extent),
-        partial(measured_run, numbers=study.measure),
+        paper_study.study_runs(extent),
+        partial(measured_run, numbers=paper_study.measure),
         workers,
         store=output / RUNS,
         fresh=fresh,
@@ -131,7 +131,7 @@ def run_study(
     )
 
 
-def _origin(extent: study.Extent, *, quick: bool) -> str:
+def _origin(extent: paper_study.Extent, *, quick: bool) -> str:
     words = [
         f'version {VERSION}, sources {source_digest()}',
         f'{len(extent.seeds)} held-out seeds, runs of {extent.duration:g} s at 100 Hz',
@@ -311,7 +311,7 @@ EXHIBITS = (
         'Paired differences on the same seeds with their 95 % intervals at noise 0.04: a part '
         'helps where the whole interval lies left of zero. An asterisk in the tables: it excludes '
         'zero.',
-        tuple(f'{part} is missed' for part in study.WITHOUT),
+        tuple(f'{part} is missed' for part in paper_study.WITHOUT),
         'parts',
         lambda m: paper_figures.parts(m.results),
         'What each part is worth',

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.system import QuadraticSystem
+from t3mpc_ros.chaos.system_equations import QuadraticSystem
 from t3mpc_ros.geometry.polyline import polyline_length
 from t3mpc_ros.geometry.types import Array
 

@@ -40,9 +40,9 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     patrol_metrics,
     visits,
 )
-from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.run_key import digest
+from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, reporting
+from t3mpc_ros.evaluation import html_page, report_table, result_formats
 from t3mpc_ros.evaluation.confidence_intervals import (
     Difference,
     format_interval,
@@ -29,6 +29,7 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     mean,
     paired,
 )
+from t3mpc_ros.evaluation.figure_style import TitledDrawing, draw_world, new_figure, whisker
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     BOXES,
     CLEARANCE,
@@ -39,7 +40,6 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.plotting import TitledDrawing, draw_world, new_figure, whisker
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.simulation.world import World
 from t3mpc_ros.version import VERSION
@@ -205,7 +205,9 @@ def surprise_table(study: PatrolStudy) -> report_table.Table:
 
 
 def _cell(rows: Sequence[Row], column: str, digits: int = 3, factor: float = 1.0) -> str:
-    return reporting.format_mean([factor * row[column] for row in rows if column in row], digits)
+    return result_formats.format_mean(
+        [factor * row[column] for row in rows if column in row], digits
+    )
 
 
 def description(plan: PatrolPlan) -> str:

@@ -38,7 +38,7 @@ from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
 from t3mpc_ros.evaluation.loop import reports_of, run_loop
 from t3mpc_ros.evaluation.patrol.pure_pursuit import PathTracker
-from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, stamp_of
+from t3mpc_ros.evaluation.run_record import ON_PATH, RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist

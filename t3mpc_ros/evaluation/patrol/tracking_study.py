@@ -38,9 +38,9 @@ from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     Pursuit,
     RegulatedParameters,
 )
-from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.run_key import digest
+from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import time_path

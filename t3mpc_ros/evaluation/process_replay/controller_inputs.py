@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import TopicColumns, read_columns
-from t3mpc_ros.bag.controller_journal import (
+from t3mpc_ros.bag.controller_input_journal import (
     COMMAND_EVENTS,
     Event,
     parameters_from_json,
@@ -83,7 +83,10 @@ class ControllerSession:
     first: int
     """Index of its first row over all sessions."""
     rows: Integers
-    """The journal, shape (n, 5), see :data:`~t3mpc_ros.bag.controller_journal.JOURNAL_COLUMNS`."""
+    """The journal, shape (n, 5).
+
+    Columns: :data:`~t3mpc_ros.bag.controller_input_journal.JOURNAL_COLUMNS`.
+    """
     taken: ConsumedMessages
     exact: Flags
     """Whether all inputs are in the bag, so that the output must be equal, shape (n,)."""
@@ -425,7 +428,7 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
     """Return the messages that the controller processed, by its journal.
 
     ``rows`` is the journal of one session of the controller, shape (n, 5), see
-    :mod:`t3mpc_ros.bag.controller_journal`; stamps of the messages are in order of receipt.
+    :mod:`t3mpc_ros.bag.controller_input_journal`; stamps of the messages are in order of receipt.
     """
     number, event, stamp, handed, value = rows.T
     steps = event == Event.STEP

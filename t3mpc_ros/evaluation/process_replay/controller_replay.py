@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from t3mpc_ros.bag.controller_journal import (
+from t3mpc_ros.bag.controller_input_journal import (
     Event,
     reading_from_value,
 )

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation import plotting
-from t3mpc_ros.evaluation.plotting import COLOURS
+from t3mpc_ros.evaluation import figure_style
+from t3mpc_ros.evaluation.figure_style import COLOURS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     ControllerInputs,
@@ -308,15 +308,15 @@ def _format_values(values: Sequence[object]) -> str:
 
 def write_divergence_figure(outcome: Comparison, path: Path) -> None:
     """Write a PNG of the first divergence of the replay from the recording."""
-    figure = plotting.drawing(_draw, outcome)
+    figure = figure_style.drawing(_draw, outcome)
     if figure is not None:
-        write_atomically(path, plotting.file_of(figure, 'png'))
+        write_atomically(path, figure_style.file_of(figure, 'png'))
 
 
 def _draw(outcome: Comparison) -> Any:
     first = outcome.first
     fields = [row.field for row in outcome.rows]
-    figure = plotting.new_figure(2.0 + 0.16 * len(fields) + (3.6 if first else 0.0))
+    figure = figure_style.new_figure(2.0 + 0.16 * len(fields) + (3.6 if first else 0.0))
     if first is None:
         _overview(figure.subplots(), outcome, fields)
         figure.suptitle(outcome.verdict(), fontsize=9)
@@ -351,8 +351,8 @@ def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: floa
     apart.set_title(f'difference of {name}')
     for axis in (close, apart):
         axis.axvline(when, color=COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
-        plotting.add_legend(axis)
-    plotting.name_time([close, apart])
+        figure_style.add_legend(axis)
+    figure_style.name_time([close, apart])
     apart.set_xlim(max(when - BEFORE, time[0]), min(when + AFTER, time[-1]))
     close.tick_params(labelbottom=False)
 
@@ -371,4 +371,4 @@ def _overview(axis: Any, outcome: Comparison, fields: list[str]) -> None:
     axis.set_yticks(range(len(fields)), fields, fontsize=6)
     axis.set_title('compared (pale), beyond the tolerance (dark)')
     axis.grid(visible=False)
-    plotting.name_time([axis])
+    figure_style.name_time([axis])

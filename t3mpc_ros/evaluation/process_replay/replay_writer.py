@@ -20,7 +20,7 @@ import struct
 
 import numpy as np
 
-from t3mpc_ros.bag.controller_journal import parameters_to_json
+from t3mpc_ros.bag.controller_input_journal import parameters_to_json
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (

@@ -25,16 +25,16 @@ from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcController
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
-from t3mpc_ros.evaluation.drivers import MethodSpec, pretrain
 from t3mpc_ros.evaluation.experiment import Job, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.loop_drivers import MethodSpec, pretrain
+from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import (
     ProposedController,
     ProposedParameters,
 )
-from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.evaluation.scenario import (
     PLANT_OF,
     PRETRAINING_DURATION,
@@ -71,7 +71,7 @@ from t3mpc_ros.evaluation.training.training_data import (
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.version_and_commit import provenance
 
 FOLDS = 5
 """Number of blocks of a single bag."""

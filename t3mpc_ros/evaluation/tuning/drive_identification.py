@@ -27,7 +27,7 @@ import numpy as np
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control import dead_time_estimator
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series, load_run
 from t3mpc_ros.evaluation.drive_response import (
     DEAD_TIME,
     LAG,

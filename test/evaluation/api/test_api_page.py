@@ -21,7 +21,7 @@ import pytest
 from support.checkout import ROOT
 
 import t3mpc_ros as t3
-from t3mpc_ros.evaluation.api.script_parts import check_method
+from t3mpc_ros.evaluation.api.script_inputs import check_method
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.scenario import Scenario
 

@@ -58,7 +58,7 @@ def test_the_extra_of_comparisons_is_enough_for_them():
 
 def test_generator_and_fuzzy_system_are_functions_in_any_order():
     """Both are packages, too: importing a module of one must not replace the function."""
-    import t3mpc_ros.chaos.system
+    import t3mpc_ros.chaos.system_equations
     import t3mpc_ros.fuzzy.inference
 
     assert t3mpc_ros.chaos is t3.chaos is sys.modules['t3mpc_ros.chaos']

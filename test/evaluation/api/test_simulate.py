@@ -23,7 +23,7 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.evaluation.api.own_reference import sampled
-from t3mpc_ros.evaluation.api.script_parts import loaded
+from t3mpc_ros.evaluation.api.script_inputs import loaded
 
 PERIOD = 0.01
 SHORT = {'plant': 'servo', 'duration': 4.0}
@@ -71,8 +71,8 @@ def test_function_class_and_object_are_the_same_controller():
 def test_results_are_those_of_the_comparison():
     """The interface adds no second loop: it gives the numbers of the tables."""
     from t3mpc_ros.evaluation.loop import run
-    from t3mpc_ros.evaluation.methods import methods_for
-    from t3mpc_ros.evaluation.record import measure
+    from t3mpc_ros.evaluation.method_table import methods_for
+    from t3mpc_ros.evaluation.run_record import measure
     from t3mpc_ros.evaluation.scenario import Scenario
 
     found = t3.simulate('ADRC', seed=203, **SHORT)

@@ -26,7 +26,8 @@ from t3mpc_ros.bag.errors import DataError
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history, link_metrics
-from t3mpc_ros.evaluation.bag_report.continuity import (
+from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
+from t3mpc_ros.evaluation.bag_report.motion_continuity import (
     MIN_JUMPS,
     MIXED_SHARE,
     MIXED_STEP,
@@ -35,7 +36,6 @@ from t3mpc_ros.evaluation.bag_report.continuity import (
     other_units,
     pose_jumps,
 )
-from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,

@@ -35,8 +35,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
 from t3mpc_ros.evaluation.api.noise_law import NoiseLaw, gaussian_noise
+from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.api.own_reference import sampled
 from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
@@ -45,9 +45,9 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS, LinkFaults
-from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.loop import ComparedMethod
-from t3mpc_ros.evaluation.methods import methods_for, require_libraries
+from t3mpc_ros.evaluation.loop_drivers import MethodDriver, MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.method_table import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array, read_only

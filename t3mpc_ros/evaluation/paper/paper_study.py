@@ -20,12 +20,12 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
-from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Run
-from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
-from t3mpc_ros.evaluation.methods import methods
-from t3mpc_ros.evaluation.record import START, Record
+from t3mpc_ros.evaluation.loop_drivers import MethodSpec
+from t3mpc_ros.evaluation.method_table import STAGES as METHOD_STAGES
+from t3mpc_ros.evaluation.method_table import methods
 from t3mpc_ros.evaluation.run_key import digest
+from t3mpc_ros.evaluation.run_record import START, Record
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario, held_out
 
 DRIVES = ('torque', 'velocity')

@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
 )
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.record import RATE, stamp_of
+from t3mpc_ros.evaluation.run_record import RATE, stamp_of
 from t3mpc_ros.evaluation.scenario import (
     LEAD,
     PLANT_OF,
