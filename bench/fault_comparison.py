@@ -134,6 +134,13 @@ def of_the_world(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
     return {'twist': BodyTwist(linear * math.cos(odometry.pose.yaw), angular)}
 
 
+def held(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
+    """Return the twist of every fifth message: that of a stream of 20 Hz."""
+    if k % 5 == 0 or link.kept is None:
+        link.kept = odometry.twist
+    return {'twist': link.kept}
+
+
 def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
     """Return a fault of the pose in each report."""
     return with_odometry(
@@ -202,6 +209,7 @@ FAULTS: Mapping[str, Fault] = {
     'no twist in every second message': Fault(
         send=with_odometry(lambda link, k, odometry: {'twist': STANDSTILL} if k % 2 else {})
     ),
+    'twist of the odometry held for 50 ms': Fault(send=with_odometry(held)),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
     ),
