@@ -329,7 +329,7 @@ class WatchedDriver(NodeDriver):
         controller, odometry = self._controller, state.odometry
         status = controller.status
         known = None if controller.odometry_twist.replaced else self._command
-        following = status.reason is Reason.TRACKING
+        following = status.reason is Reason.TRACKING and not controller.wheel_monitor.outside
         if not controller.doubts_odometry:
             periods = controller.stamp_filter.periods
             self._monitor.update(

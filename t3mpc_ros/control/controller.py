@@ -53,6 +53,7 @@ from t3mpc_ros.control.watchdog import (
     Reason,
     ResponseMonitor,
     WatchdogParameters,
+    WheelMonitor,
 )
 from t3mpc_ros.geometry import kinematics
 from t3mpc_ros.geometry.kinematics import (
@@ -311,6 +312,8 @@ class Controller:
         self._sample_reference = TypedKernel(sample_reference)
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
+        self.wheel_monitor = WheelMonitor(parameters.watchdog, self._period)
+        """Which wheel was at a speed that no command of late explains."""
         self._trajectory = ReferenceTrajectory(_least_jump(parameters.limits))
         self._snapshot_steps = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
         self._jumps: list[Jump] = []
@@ -388,6 +391,8 @@ class Controller:
         if self.keep_out is not None and self._last_stamp_ns is not None:
             found.append(self.keep_out.ranges.problem())
         found += [self.stamp_filter.problem(), self.odometry_twist.problem()]
+        if not self.drive_monitor.pauses:  # else the whole robot does not follow
+            found.append(self.wheel_monitor.problem())
         configured = self.parameters.speed_filter.dead_time
         in_use, lag = self._dead_time, self.parameters.speed_filter.lag
         if self._excess_lag > 0.0 and in_use < -NO_DEAD_TIME:
@@ -472,6 +477,7 @@ class Controller:
         self.body.reset()
         self._stop()
         self._response.reset()
+        self.wheel_monitor.reset()
         self.pose_controller.reset()
         self._begin()
         if self.keep_out is not None:
@@ -537,6 +543,7 @@ class Controller:
         if believed and twist.replaced and not (twist.missing and twist.known):
             elapsed = None  # the speeds before were no measurements: all estimates begin again
             self.dead_time = self._make_dead_time_estimator()
+            self.wheel_monitor.reset()
         if restarted:
             self._clear_reference()
             if self.keep_out is not None:
@@ -574,7 +581,10 @@ class Controller:
             self._moving = True
             return self._command_unresponsive(odometry, dt)
         restart = elapsed is None or not self._moving
+        if not restart:
+            self.wheel_monitor.update(stamp, speeds.tolist(), actuation.command.tolist())
         if restart:
+            self.wheel_monitor.interrupt()
             actuation.reset(speeds)
             self._response.reset()
             self._snapshots.clear()

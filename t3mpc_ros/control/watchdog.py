@@ -14,6 +14,7 @@
 """Whether the robot may move, and why not; and whether it follows the commands."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 import enum
 import math
@@ -309,6 +310,120 @@ class ResponseMonitor:
         if self.evidence >= EVIDENCE_WEIGHT * self._timeout_steps:
             self.responsive, self.evidence = not self.responsive, 0
         return self.responsive
+
+
+MEAN_TIME, NOISE_STEPS = 0.1, 300
+"""Time over which a measured speed is averaged (s), and the steps over which its noise is."""
+WHEEL_OUTSIDE = 5.0, 0.05, 0.05
+"""Distance of the mean from the range of the commands that no noise explains: its standard
+deviations, the speed that is added (rad/s), and the share of the nearest command: a twist of the
+odometry may be wrong by that."""
+WHEEL_STEPS, WHEEL_GAP = 5, 1.0
+"""Number of such steps from which a wheel did not follow, and the longest time between two (s)."""
+WHEEL_WAIT, WHEEL_RECENT = 2.0, 10.0
+"""Time after which it is reported, and for which, s: by then a wrong twist in the odometry, which
+looks alike, is found."""
+AT_LIMIT = 0.95  # share of the largest speed of late from which a wheel may be at a limit
+LARGEST_MEMORY = 3000  # steps over which the largest speed is forgotten
+
+
+class WheelMonitor:
+    """Says which wheel was at a speed that no command of late explains, for diagnostics only.
+
+    A wheel whose commands are lost for a moment, and one at a limit of the robot, are less than
+    ``response_bound`` off, or for less than ``response_timeout``. The mean of some measurements
+    shows a quarter of that (noise 0.04 (rad/s)²), whatever the delay within ``response_window``.
+    """
+
+    def __init__(self, parameters: WatchdogParameters, period: float) -> None:
+        self._mean_steps = max(1, round(MEAN_TIME / period))
+        steps = self._mean_steps + max(1, round(parameters.response_window / period))
+        self._enabled = parameters.response_bound > 0.0
+        self._commands: tuple[deque[float], ...] = (deque(maxlen=steps), deque(maxlen=steps))
+        self._measured: tuple[deque[float], ...] = tuple(
+            deque(maxlen=self._mean_steps) for _ in range(2)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the speeds before were no measurements."""
+        self._noise, self._samples = [0.0, 0.0], 0
+        self._largest = [0.0, 0.0]
+        self._now_ns = self._begin_ns = self._last_ns = 0
+        self._steps = 0
+        self._worst = 0, 0.0, 0.0
+        """Wheel, mean speed and nearest command (rad/s) where they were farthest apart."""
+        self._at_limit = False
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Forget the newest commands and speeds: the robot stops."""
+        for values in (*self._commands, *self._measured):
+            values.clear()
+
+    @property
+    def outside(self) -> bool:
+        """Whether a wheel was at such a speed in the last second."""
+        return self._steps > 0 and self._now_ns - self._last_ns <= WHEEL_GAP * NANOSECONDS
+
+    def update(self, stamp_ns: int, speeds: Sequence[float], command: Sequence[float]) -> None:
+        """Add measured wheel speeds and the command that was sent before, rad/s."""
+        if not self._enabled:
+            return
+        self._now_ns = stamp_ns
+        self._samples += 1
+        share = max(1.0 / self._samples, 1.0 / NOISE_STEPS)
+        for wheel in range(2):
+            commands, measured, speed = self._commands[wheel], self._measured[wheel], speeds[wheel]
+            commands.append(command[wheel])
+            if measured:
+                half_square = 0.5 * (speed - measured[-1]) ** 2
+                self._noise[wheel] += share * (half_square - self._noise[wheel])
+            measured.append(speed)
+            if len(commands) < (commands.maxlen or 0):
+                continue
+            mean = sum(measured) / self._mean_steps
+            times, least, part = WHEEL_OUTSIDE
+            bound = times * math.sqrt(self._noise[wheel] / self._mean_steps) + least
+            kept = (1.0 - 1.0 / LARGEST_MEMORY) * self._largest[wheel]
+            self._largest[wheel] = max(abs(mean), kept)
+            if abs(mean - commands[-self._mean_steps]) <= bound:
+                continue
+            nearest = min(max(mean, min(commands)), max(commands))
+            if abs(mean - nearest) > bound + part * abs(nearest):
+                self._add(wheel, mean, nearest)
+
+    def _add(self, wheel: int, mean: float, nearest: float) -> None:
+        """Count a step with a wheel outside."""
+        longest = WHEEL_RECENT if self._steps >= WHEEL_STEPS else WHEEL_GAP
+        if self._now_ns - self._last_ns > longest * NANOSECONDS:
+            self._steps, self._begin_ns = 0, self._now_ns
+        if self._steps == 0 or abs(mean - nearest) > abs(self._worst[1] - self._worst[2]):
+            self._worst = wheel, mean, nearest
+            # At a limit it is slower than commanded, and as fast as it ever is.
+            slower = mean * nearest > 0.0 and abs(mean) < abs(nearest)
+            self._at_limit = slower and abs(mean) > AT_LIMIT * self._largest[wheel]
+        self._steps += 1
+        self._last_ns = self._now_ns
+
+    def problem(self) -> str:
+        """Return which wheel did not follow, and the remedy; '' if none was found of late."""
+        since_begin, age = (
+            (self._now_ns - time) / NANOSECONDS for time in (self._begin_ns, self._last_ns)
+        )
+        if self._steps < WHEEL_STEPS or since_begin < WHEEL_WAIT or age > WHEEL_RECENT:
+            return ''
+        wheel, mean, nearest = self._worst
+        text = (
+            f'the {("right", "left")[wheel]} wheel had {mean:.2f} rad/s, the nearest of its '
+            f'commands {nearest:.2f} rad/s, {age:.0f} s ago'
+        )
+        if self._at_limit:
+            return f'{text}: it gets no faster, lower the limits here to those of the robot'
+        return (
+            f'{text}: commands of it are lost, it is blocked or at a limit of the robot, or it '
+            'responds later than watchdog.response_window'
+        )
 
 
 MOTION, ASKED_MOTION = (0.03, 0.15), (0.1, 0.5)

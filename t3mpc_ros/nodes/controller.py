@@ -271,7 +271,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._publish_command(command, status.stamp_ns)
         # Poses alone are differentiated, which says little about a gain.
         known = None if self._controller.odometry_twist.replaced else self._last_command
-        following = status.reason is Reason.TRACKING
+        outside = self._controller.wheel_monitor.outside
+        following = status.reason is Reason.TRACKING and not outside
         if not self._controller.doubts_odometry:
             periods = self._controller.stamp_filter.periods
             self._odometry_monitor.update(

@@ -39,6 +39,7 @@ from t3mpc_ros.control.watchdog import (
     ResponseMonitor,
     StopHistory,
     WatchdogParameters,
+    WheelMonitor,
 )
 from t3mpc_ros.geometry.kinematics import advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, Pose, State
@@ -673,3 +674,44 @@ def test_a_stop_between_two_reports_is_in_the_next_one():
     assert stops.unreported(6 * second) == ''  # the report says so itself
     stops.update(Reason.TRACKING, 7 * second)
     assert stops.unreported(8 * second) == ''
+
+
+def _problems(of_right, *, seconds=12.0, delay=3):
+    """Return what is said of a robot whose right wheel does ``of_right`` of time and command."""
+    monitor, random, sent = WheelMonitor(WatchdogParameters(), 0.01), np.random.default_rng(1), []
+    found = set()
+    for k in range(round(100 * seconds)):
+        given = sent[max(k - 1 - delay, 0)] if sent else (0.0, 0.0)
+        speeds = of_right(0.01 * k, given[0]), given[1]
+        if sent:
+            monitor.update(k * 10 * MS, (speeds + random.normal(0.0, 0.2, 2)).tolist(), sent[-1])
+        sent.append((5.0 * math.sin(0.02 * k), 4.0 * math.cos(0.013 * k)))
+        if k % 100 == 0:
+            found.add(monitor.problem())
+    return found - {''}
+
+
+@pytest.mark.parametrize('delay', [0, 3, 14])
+def test_nothing_is_said_of_wheels_that_follow_their_commands(delay):
+    assert _problems(lambda time, given: given, seconds=120.0, delay=delay) == set()
+
+
+def test_a_wheel_that_is_dead_for_a_moment_is_named():
+    """A wheel without commands for 0.3 s made ten times the error, and nothing was said."""
+    found = _problems(lambda time, given: 0.0 if 4.0 <= time < 4.3 else given)
+    assert found
+    for text in found:
+        assert text.startswith('the right wheel had ')
+        assert 'commands of it are lost' in text
+
+
+def test_a_wheel_at_a_limit_of_the_robot_is_named():
+    """It was said to have a wrong radius, or another dead time."""
+    found = _problems(lambda time, given: min(max(given, -4.0), 4.0))
+    assert found
+    for text in found:
+        assert 'it gets no faster' in text
+
+
+def test_a_factor_of_the_measured_speeds_is_no_dead_wheel():
+    assert _problems(lambda time, given: 1.04 * given, seconds=30.0) == set()
