@@ -858,7 +858,7 @@ class Controller:
         Both times are from one clock of the caller. After a time-out the controller clears its
         state, and the next odometry message is a new start.
         """
-        if not self._watchdog.odometry_timed_out(last_received_ns, now_ns):
+        if not self._watchdog.check_silence(last_received_ns, now_ns):
             return False
         self._stop()
         self.status = self._make_status(self._last_stamp_ns or 0, Reason.NO_ODOMETRY)

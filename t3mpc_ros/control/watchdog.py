@@ -134,7 +134,7 @@ class InputWatchdog:
     """Decides at each step whether odometry and reference are recent and plausible.
 
     The decision uses message stamps only and reads no clock; it is a function of the messages in
-    their order of arrival. Missing odometry is the exception, see :meth:`odometry_timed_out`.
+    their order of arrival. Missing odometry is the exception, see :meth:`check_silence`.
     """
 
     def __init__(self, parameters: WatchdogParameters) -> None:
@@ -245,8 +245,8 @@ class InputWatchdog:
             'wheel_radius'
         )
 
-    def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
-        """Whether the odometry is older than the time-out; both times are from one clock.
+    def check_silence(self, last_received_ns: int | None, now_ns: int) -> bool:
+        """Find out whether the odometry is older than the time-out; both times are of one clock.
 
         If so, the stamp of the next message is believed: :meth:`ignores` has no doubt after it.
         """

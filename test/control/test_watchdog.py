@@ -163,9 +163,9 @@ class TestWatchdog(WatchdogMachine.TestCase):
 
 def test_the_odometry_timeout_is_measured_with_one_clock():
     watchdog = InputWatchdog(WatchdogParameters(odometry_timeout=0.2))
-    assert watchdog.odometry_timed_out(None, 0)
-    assert not watchdog.odometry_timed_out(1000 * MS, 1200 * MS)
-    assert watchdog.odometry_timed_out(1000 * MS, 1200 * MS + 1)
+    assert watchdog.check_silence(None, 0)
+    assert not watchdog.check_silence(1000 * MS, 1200 * MS)
+    assert watchdog.check_silence(1000 * MS, 1200 * MS + 1)
 
 
 NEAR = st.sampled_from((0.0, 1.0, 1.5, -3.0, 4.0))

@@ -34,11 +34,13 @@ def test_values_that_destabilised_are_refused_or_harmless(monkeypatch):
     slow = judge({'jump_transition.acceleration': 0.1})  # never arrived at the reference
     assert 'jump_transition.acceleration must be from 1 to 10000 rad/s²' in slow.refused
     assert 'body.yaw_gain must be from 0 to 1' in judge({'body.yaw_gain': 20.0}).refused
-    worst = judge(
-        {**BODY, 'law.gain': 78.0, 'body.yaw_gain': 1.0, 'body.max_yaw_correction': 10.0}
-    )
+    allowed = {**BODY, 'law.gain': 78.0, 'body.yaw_gain': 1.0, 'body.max_yaw_correction': 10.0}
+    worst = judge(allowed)
     assert not worst.bad
     assert worst.ratio > 0.1
+    # The exact robot needs no correction of the body; with wrong radii and track these values act.
+    wrong_body = judge(allowed, 'radii and track')
+    assert 0.1 < wrong_body.ratio < 0.9
 
 
 @pytest.mark.long
