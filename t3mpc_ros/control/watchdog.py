@@ -370,6 +370,8 @@ class WheelMonitor:
         """Add measured wheel speeds and the command that was sent before, rad/s."""
         if not self._enabled:
             return
+        if stamp_ns < self._now_ns:  # the clock was set back: no time of before has an age
+            self.reset()
         self._now_ns = stamp_ns
         self._samples += 1
         share = max(1.0 / self._samples, 1.0 / NOISE_STEPS)

@@ -715,3 +715,17 @@ def test_a_wheel_at_a_limit_of_the_robot_is_named():
 
 def test_a_factor_of_the_measured_speeds_is_no_dead_wheel():
     assert _problems(lambda time, given: 1.04 * given, seconds=30.0) == set()
+
+
+def test_no_wheel_is_outside_after_a_clock_was_set_back():
+    """For an hour after a leap of an hour, no gain of the wheels was found."""
+    monitor, hour = WheelMonitor(WatchdogParameters(), 0.01), 3600 * NANOSECONDS
+    for k in range(400):
+        right = 0.0 if 300 <= k < 330 else 5.0
+        monitor.update(hour + k * 10 * MS, [right, 4.0], [5.0, 4.0])
+        if k == 330:
+            assert monitor.outside
+    for k in range(100):
+        monitor.update(k * 10 * MS, [5.0, 4.0], [5.0, 4.0])
+        assert not monitor.outside
+    assert monitor.problem() == ''
