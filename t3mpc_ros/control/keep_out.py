@@ -74,6 +74,9 @@ NOBODY, SEVERAL = -2, -1
 NEAREST_TRUSTED = 0.08
 """Distance from the face of a sensor below which a ray neither clears nor marks: a Sharp sensor
 reads 13 cm for an object at 3 cm."""
+NEAR_HIT = 0.05
+"""Distance from that face at which a thing is marked that is nearer than the sensor measures, m:
+within the distance that the robot keeps, because at a centimetre it reads as far away."""
 STANDING_ROOM = 0.12  # radius of the floor that is free because the robot stands there, m
 MEMORY = 60.0  # default time after which floor that was seen to be free counts as unseen, s
 MARGIN = 25  # cells of unknown floor around what is published
@@ -103,6 +106,12 @@ SECTORS = 16  # sectors around the robot, each with its nearest unsafe cell
 SEARCH_RADIUS = 0.5  # distance from the centre up to which cells are considered, m
 CAUTIOUS_SPEED = 0.12
 """Largest speed of a robot that sees less than usual, or where something has come, m/s."""
+VISITED_SPEED, VISITED_FOR = 0.2, 30.0
+"""Largest speed (m/s) for a time (s) after somebody was about: who steps in between the beams
+reckons with the speed of a robot that sets off, and is there before it has been seen."""
+VISIT = 0.5
+"""Time for which something comes where somebody is about, s: readings of an edge beside its beam
+do so for 0.3 s, people for at least 0.6 s."""
 TOUCHED_SIZE = 0.15
 """Half the width, and the depth, that a thing is taken to have which the robot has touched and
 cannot see, m."""
@@ -199,6 +208,9 @@ class FreeSpaceMap:
         self.now = 0.0  # time since then, s
         self.last_come = -math.inf
         """Time of the last reading of a thing that had come, s; see :func:`has_come`."""
+        self.last_visit = -math.inf
+        """Time of the last one by which something had come for :data:`VISIT`, s."""
+        self._first_come = 0.0  # when it began to come, s
         self._hits = [(0.0, -math.inf)] * len(self._mounts)  # last hit of each sensor, m and s
         self.grid.cells[:] = UNKNOWN
         self.grid.cleared[:] = 0
@@ -318,13 +330,17 @@ class FreeSpaceMap:
             self.now,
             *self._face(sensor, pose),
             max(hit - error, 0.0),
-            0.09 if near else (hit if reading < limit else -1.0),
+            NEAR_HIT if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
             sensor,
             supported,
         )
         if come:
+            if self.now - self.last_come > NEW_FOR:
+                self._first_come = self.now
             self.last_come = self.now
+            if self.now - self._first_come > VISIT:
+                self.last_visit = self.now
 
 
 def _occupied_places(grid: OccupancyGrid) -> Array:
@@ -607,7 +623,8 @@ class KeepOut:
         self.map.clear()
         self.activity = Activity.FREE  # what it does
         self.changed = False  # whether the last twist was changed
-        self._standing_room = self._cautious = False
+        self._standing_room = False
+        self._fastest = math.inf  # largest speed for now, m/s
         self._targets: deque[float] = deque()
         self._seen_from: Pose | None = None
         self._blocked_for = 0.0
@@ -717,9 +734,12 @@ class KeepOut:
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
         self._update_nearest(pose, UNKNOWN)
-        visited = self.map.now - self.map.last_come < NEW_FOR
+        visited = self.map.now - self.map.last_visit < VISITED_FOR
+        comes = self.map.now - self.map.last_come < NEW_FOR
         touches = any(math.dist(each, pose[:2]) < TOUCHED_NEAR for each in self.touched)
-        self._cautious = visited or self.ranges.lost or touches
+        self._fastest = VISITED_SPEED if visited else math.inf
+        if comes or self.ranges.lost or touches:
+            self._fastest = CAUTIOUS_SPEED
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING
@@ -768,7 +788,7 @@ class KeepOut:
             self._nearest, distance, parameters.ahead, parameters.rate, self._rows
         )
         limits = self.limits
-        fastest = min(limits.linear, CAUTIOUS_SPEED) if self._cautious else limits.linear
+        fastest = min(limits.linear, self._fastest)
         # Where no sensor looks behind it, the robot does not back away from what is ahead.
         astern = 0.0 if self.ranges.is_blind(astern=True) else fastest
         for sign, most in ((1.0, fastest), (-1.0, astern)):

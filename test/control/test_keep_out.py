@@ -30,6 +30,9 @@ from t3mpc_ros.control.keep_out import (
     NEW_FOR,
     OCCUPIED,
     UNKNOWN,
+    VISIT,
+    VISITED_FOR,
+    VISITED_SPEED,
     Activity,
     KeepOut,
     KeepOutParameters,
@@ -477,6 +480,33 @@ def test_a_robot_drives_slowly_where_a_thing_has_come(distance):
     assert speed(0.0) == pytest.approx(-CAUTIOUS_SPEED)
     floor.keep_out.reset()
     assert floor.map.last_come == -math.inf
+
+
+@pytest.mark.parametrize(('hits', 'visited'), [(2, False), (3, True)])
+def test_a_robot_drives_more_slowly_while_somebody_is_about(hits, visited):
+    """Eleven of 27 robots touched one who stepped in as they set off; an edge comes briefly."""
+    floor = Floor()
+    for k in range(hits):
+        floor.hit(0.6 - 0.15 * k, 0.6 * VISIT if k else 0.0)
+        floor.map.grid.seen[floor.map.grid.cells == FREE] = floor.map.now
+    assert floor.map.last_come == floor.map.now
+    floor.map.now += NEW_FOR + 0.1
+    floor.map.grid.seen[floor.map.grid.cells == FREE] = floor.map.now
+    assert _speed_astern(floor) == pytest.approx(-VISITED_SPEED if visited else -0.24)
+    floor.map.now += VISITED_FOR
+    floor.map.grid.seen[floor.map.grid.cells == FREE] = floor.map.now
+    assert _speed_astern(floor) == pytest.approx(-0.24)
+
+
+@pytest.mark.parametrize('folded', [0.2, 0.5, math.inf])
+def test_a_thing_too_near_to_be_measured_is_not_approached(folded):
+    """A leg at a centimetre read as far away, and the robot that stood at it touched it again."""
+    floor = Floor()
+    floor.hit(-math.inf)
+    for _ in range(2 * CLEARINGS):
+        floor.read(folded, 0.038)
+    assert floor.keep_out.step(BodyTwist(0.24, 0.0), ORIGIN, 0.0).linear < 1e-3
+    assert floor.keep_out.step(BodyTwist(-0.1, 0.0), ORIGIN, 0.0).linear == pytest.approx(-0.1)
 
 
 def test_a_robot_that_begins_knows_of_nothing_that_came():
