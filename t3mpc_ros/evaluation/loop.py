@@ -35,6 +35,8 @@ from t3mpc_ros.simulation.plant_adapter import Signals, SimulatedRobot
 
 Loop = Generator[RobotState, RobotCommand, Record]
 """Closed loop that yields reports and takes commands."""
+DIVERGED_SPEED = 1e4
+"""Wheel speed from which on a run has diverged, rad/s: fifty times what a robot may have."""
 _NO_RANGES = (math.nan,) * len(RANGE_SENSORS)
 
 
@@ -157,7 +159,7 @@ def reports_of(
         now = stamp_of(k) / NANOSECONDS
         driver.begin(k, enabled=not any(begin <= now < end for begin, end in paused))
         state = robot.advance(stamp_of(k))
-        whole = all(map(math.isfinite, state.true_wheels or state.wheels))
+        whole = all(abs(speed) < DIVERGED_SPEED for speed in state.true_wheels or state.wheels)
         if whole:
             reports.send(state)
             for arrival_ns, report in reports.arrived(stamp_of(k + 1) - 1):

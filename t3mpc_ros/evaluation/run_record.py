@@ -162,7 +162,7 @@ class Record:
 
     @property
     def finite(self) -> bool:
-        """Whether the run went to its end: every number is finite."""
+        """Whether the run went to its end: it did not diverge."""
         return bool(np.isfinite(self.speeds).all() and np.isfinite(self['sent']).all())
 
     @property

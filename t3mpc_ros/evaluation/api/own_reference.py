@@ -124,7 +124,7 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
     if isinstance(source, Waypoints):
         speeds = _wheels(source.twists(time), geometry)
     elif isinstance(source, str | os.PathLike):
-        speeds = read_csv(Path(source), time, geometry)
+        speeds = read_csv(Path(source), time, duration, geometry)
     elif callable(source):
         speeds = np.array([_row(source, t) for t in time.tolist()])
     else:
@@ -134,7 +134,8 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
                 'reference must have the shape (n, 2), n >= 2: right and left wheel speed in '
                 f'rad/s, {RATE:g} rows a second: got {given.shape}'
             )
-        speeds = given[np.minimum(np.arange(rows), len(given) - 1)]  # the last row is held
+        _check_span('reference', 0.0, (len(given) - 1) / RATE, duration)
+        speeds = given[np.minimum(np.arange(rows), len(given) - 1)]
     if (fastest := np.max(np.abs(speeds))) > MAX_SPEED:
         raise ScriptError(
             f'reference must be from {-MAX_SPEED:g} to {MAX_SPEED:g} rad/s, the highest '
@@ -147,6 +148,23 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
     switched[1:] &= ~switched[:-1]  # the row after a jump leaves the line of the jump
     modes = np.cumsum(switched, dtype=np.int64)
     return SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
+
+
+def _check_span(name: str, first: float, last: float, duration: float) -> None:
+    """Raise :class:`ScriptError` unless times (s) from first to last are those of a run.
+
+    Beyond them a row would be held, and the robot would be judged by how it stands.
+    """
+    if first > 1.0 / RATE:
+        raise ScriptError(
+            f'{name} must begin at 0 s, where the run begins: got {first:.10g} s; subtract the '
+            'first time from all'
+        )
+    if last < duration - 1.5 / RATE:
+        raise ScriptError(
+            f'{name} must last as long as the run, {duration:g} s: got {last:.4g} s; choose a '
+            'shorter duration, or repeat the last row if the robot is to go on with it'
+        )
 
 
 def numbers(name: str, given: Any, shape: str) -> Array:
@@ -186,11 +204,11 @@ def _row(function: Callable[[float], Any], time: float) -> Array:
     return found
 
 
-def read_csv(path: Path, time: Array, geometry: WheelGeometry) -> Array:
+def read_csv(path: Path, time: Array, duration: float, geometry: WheelGeometry) -> Array:
     """Return wheel speeds (rad/s) at some times from a CSV file, interpolated, shape (n, 2).
 
     Its first line names the columns: ``time`` (s) with ``right`` and ``left`` (rad/s), or with
-    ``linear`` (m/s) and ``angular`` (rad/s). The first and the last row are held.
+    ``linear`` (m/s) and ``angular`` (rad/s). It lasts for the run; the last row is held after it.
     """
     try:
         with path.expanduser().open(newline='', encoding='utf-8-sig') as stream:
@@ -214,6 +232,7 @@ def read_csv(path: Path, time: Array, geometry: WheelGeometry) -> Array:
     table = numbers(str(path), table, '(n, 3)')
     if len(table) < 2 or not (np.diff(table[:, 0]) > 0.0).all():
         raise ScriptError(f'{path} must have two rows or more, with ascending times')
+    _check_span(str(path), float(table[0, 0]), float(table[-1, 0]), duration)
     found = np.column_stack([np.interp(time, table[:, 0], table[:, i]) for i in (1, 2)])
     return found if kind == WHEELS else _wheels(found, geometry)
 

@@ -490,6 +490,11 @@ def own_scenario(
             )
         schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
         events = schedule.events
+        if events and all(event.at >= duration for event in events):
+            raise ScriptError(
+                f'faults must begin within the run, which lasts {duration:g} s: got '
+                f'{min(event.at for event in events):g} s as the first begin'
+            )
     parts = OwnParts(
         reference=course,
         links=links,

@@ -141,7 +141,8 @@ def simulate(
     reference
         None: the chaotic reference of the seed. Wheel speeds (rad/s), right first, 100 rows a
         second, shape (n, 2); a function of the time (s) that returns two of them; a CSV file with
-        the columns time,right,left or time,linear,angular; or :class:`Waypoints`.
+        the columns time,right,left or time,linear,angular; or :class:`Waypoints`. Array and file
+        last at least as long as the run.
     plant
         ``'twin'``, ``'servo'``, ``'torque'``; a :class:`Robot`, :class:`OdePlant` or
         :class:`StateSpace`.
@@ -174,13 +175,13 @@ def simulate(
 
 
 def divergence(record: Record) -> str:
-    """Return when a run left the finite numbers, and from where; '' if it did not."""
+    """Return when a run diverged, and from where; '' if it did not."""
     if record.finite:
         return ''
     k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))
     last = record.speeds[max(k - 1, 0)]
     return (
-        f'{DIVERGED} at {record.time[k]:.2f} s: the last finite wheel speeds were {last[0]:.4g} '
+        f'{DIVERGED} at {record.time[k]:.2f} s: the wheel speeds before were {last[0]:.4g} '
         f'and {last[1]:.4g} rad/s'
     )
 

@@ -16,6 +16,7 @@
 import csv
 import math
 import pickle
+import re
 import sys
 
 import numpy as np
@@ -104,6 +105,26 @@ def test_array_function_and_csv_are_the_same_reference(tmp_path):
     run = t3.simulate('PI + feed-forward', reference=_wave, **SHORT)
     np.testing.assert_allclose(run['reference_right'], table[:400, 0], atol=1e-12)
     assert run.rmse(2.0) < 0.1
+
+
+@pytest.mark.parametrize(
+    ('first', 'last', 'words'),
+    [
+        (0.0, 3.9, 'must last as long as the run, 4 s: got 3.9 s; choose a shorter duration'),
+        (100.0, 104.0, 'must begin at 0 s, where the run begins: got 100 s; subtract'),
+        (1.7e9, 1.7e9 + 4.0, 'got 1700000000 s; subtract'),
+    ],
+)
+def test_a_reference_of_other_times_is_refused(first, last, words, tmp_path):
+    """The row at its end was held, and a standing robot was judged: errors of 0.0005 rad/s."""
+    path = tmp_path / 'reference.csv'
+    path.write_text(f'time,right,left\n{first!r},3,5\n{last!r},4,4\n')
+    geometry = t3.Robot().plant_parameters().geometry
+    with pytest.raises(t3.ScriptError, match=re.escape(words)):
+        sampled(path, 4.0, geometry)
+    if first == 0.0:
+        with pytest.raises(t3.ScriptError, match=re.escape(words)):
+            sampled(np.ones((391, 2)), 4.0, geometry)
 
 
 def test_a_reference_of_the_body_is_converted(tmp_path):

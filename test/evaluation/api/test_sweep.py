@@ -135,7 +135,7 @@ def test_a_table_says_which_runs_failed_and_which_diverged():
     outcomes = [line.split('|')[4].strip() for line in found.table().splitlines() if '|' in line]
     assert outcomes[3:] == ['diverged [1]', 'failed [2]']
     for shown in (str(found), found._repr_html_(), found.to_latex()):
-        assert re.search(r'\[1\] seed 1: diverged at \d.\d\d s: the last finite wheel', shown)
+        assert re.search(r'\[1\] seed 1: diverged at \d.\d\d s: the wheel speeds before', shown)
         assert re.search(r'\[2\] seed 1: raises raised RuntimeError \(no sensor', shown)
     assert r'no sensor \& no\_file' in found.to_latex()
     assert [row['error'][:8] for row in found.rows[:3]] == ['', 'diverged', 'raises r']

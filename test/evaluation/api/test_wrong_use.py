@@ -27,6 +27,8 @@ from support.long_tests import few_of
 import t3mpc_ros as t3
 
 SHORT = {'plant': 'servo', 'duration': 1.0}
+GROWING = t3.StateSpace(5.0 * np.eye(2), np.eye(2), np.eye(2))
+LATE_FAULT = t3.FaultSchedule([t3.FaultEvent(100.0, 'command_loss', 1.0)])
 
 
 def run(controller='feed-forward', **setting):
@@ -172,7 +174,15 @@ WRONG = [
         lambda: run(
             'PI + feed-forward', plant=t3.OdePlant(unstable, initial=[1.0, 1.0]), duration=1.0
         ),
-        r'run of PI \+ feed-forward diverged at 0.0\d s: the last finite wheel speeds were',
+        r'run of PI \+ feed-forward diverged at 0.0\d s: the wheel speeds before were',
+    ),
+    (  # an error of 3e14 rad/s was a number like others, and the method *better*
+        lambda: run('PI + feed-forward', plant=GROWING, duration=8.0),
+        r'run of PI \+ feed-forward diverged at \d.\d\d s: the wheel speeds before were',
+    ),
+    (
+        lambda: run('full', plant='twin', faults=LATE_FAULT, duration=8.0),
+        'faults must begin within the run, which lasts 8 s: got 100 s as the first begin',
     ),
     (
         lambda: t3.OdePlant(wrong_states),
