@@ -27,7 +27,7 @@ costs more than 15 % of the errors without it is not named on every seed.
 
 import argparse
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
 from pathlib import Path
@@ -44,6 +44,7 @@ from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.control.odometry_monitor import OdometryMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
+from t3mpc_ros.evaluation.baselines.feed_forward import FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
 from t3mpc_ros.evaluation.experiment import ResultTable, map_jobs
 from t3mpc_ros.evaluation.loop import ReportLink
@@ -63,12 +64,15 @@ from t3mpc_ros.evaluation.run_record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.robot.interface import RobotState
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 DURATION, BEGIN, NAMED = 30.0, 15.0, 5.0
 """Length of a run, begin of what does not last for the whole run, and time to name it, s."""
 MARGIN = 1.15
 """Largest ratio to the errors of the best simple method."""
+DEAD_TIME = DigitalTwinParameters().drive.dead_time
+"""Dead time of the exact robot, s."""
 SIMPLE = FEED_FORWARD, SHAPED_IN_TIME, LMS
 EXACT = NMPC + EXACT_MODEL
 WHEELS, BODY = ('settled', 'overall'), ('yaw_rate_settled', 'yaw_rate')
@@ -86,15 +90,18 @@ Send = Callable[[Any, int, RobotState], Iterable[RobotState]]
 class Fault:
     """What differs from the exact robot, or from what the controller assumes of it."""
 
-    changes: Mapping[str, object] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the robot."""
     events: Mapping[str, Any] = field(default_factory=dict)
     """Faults of the twin from :data:`BEGIN` on."""
     links: LinkFaults = NO_FAULTS
     send: Send = lambda link, k, state: [state]
     """What becomes of a report of the robot, with its number."""
-    assumed: Mapping[str, object] = field(default_factory=dict)
-    """Parameters of the controller."""
+    assumed: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters of the controller; lag, dead time and noise of the drive are those of all."""
+    spread: bool = False
+    """Whether a delay is longer or shorter by up to half a period, by seed: the simple methods use
+    whole periods alone."""
     body: bool = False
     """Whether the wheels do not move the body as assumed, so that the yaw rate alone counts."""
     lasting: float = math.inf
@@ -182,9 +189,9 @@ FAULTS: Mapping[str, Fault] = {
     '30 % of the odometry lost': Fault(links=LinkFaults(odometry_loss=0.3)),
     'odometry up to 40 ms late': Fault(links=LinkFaults(odometry_delay=(0.0, 0.04))),
     'stamps of the odometry off by up to 3 ms': Fault(send=with_odometry(jittering)),
-    'odometry 50 ms late': Fault(links=late(0.05)),
-    'odometry 100 ms late': Fault(links=late(0.1)),
-    'odometry 200 ms late': Fault(links=late(0.2)),
+    'odometry 50 ms late': Fault(links=late(0.05), spread=True),
+    'odometry 100 ms late': Fault(links=late(0.1), spread=True),
+    'odometry 200 ms late': Fault(links=late(0.2), spread=True),
     'odometry 1 s late': Fault(links=late(1.0)),
     'no twist in the odometry': Fault(send=with_twist(lambda twist: STANDSTILL)),
     'twist of the odometry + 10 %': Fault(
@@ -232,10 +239,12 @@ FAULTS: Mapping[str, Fault] = {
     'gyro bias + 0.35 rad/s': Fault(events={'gyro_bias_jump': 0.35}, begin=BEGIN),
     'gyro dead': Fault(events={'gyro_dead': True}, begin=BEGIN),
     'gyro scale + 3 %, stated': Fault(changes={'imu.gyro_scale_error': 0.03}),
+    # No signal can tell it from wheels that are nearer by as much; only LMS follows the gyro, too.
     'gyro scale + 1 %, not stated': Fault(
-        changes={'imu.gyro_scale_error': 0.01}, assumed={'body.gyro_scale_tolerance': 0.001}
+        changes={'imu.gyro_scale_error': 0.01},
+        assumed={'body.gyro_scale_tolerance': 0.001},
+        comparable=(LMS,),
     ),
-    # No signal can tell it from wheels that are 3 % nearer; only LMS follows the gyro, too.
     'gyro scale + 3 %, not stated': Fault(
         changes={'imu.gyro_scale_error': 0.03},
         assumed={'body.gyro_scale_tolerance': 0.001},
@@ -245,10 +254,14 @@ FAULTS: Mapping[str, Fault] = {
     '10 % of the commands lost': Fault(events={'command_loss': 0.1}, begin=BEGIN),
     '30 % of the commands lost': Fault(events={'command_loss': 0.3}, begin=BEGIN),
     'commands up to 50 ms late': Fault(events={'command_jitter': 0.05}, begin=BEGIN),
-    'dead time + 30 ms from 15 s on': Fault(events={'command_delay': 0.03}, begin=BEGIN),
-    'dead time + 100 ms from 15 s on': Fault(events={'command_delay': 0.1}, begin=BEGIN),
-    'dead time 30 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.03}),
-    'dead time 60 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.06}),
+    'dead time + 30 ms from 15 s on': Fault(
+        events={'command_delay': 0.03}, spread=True, begin=BEGIN
+    ),
+    'dead time + 100 ms from 15 s on': Fault(
+        events={'command_delay': 0.1}, spread=True, begin=BEGIN
+    ),
+    'dead time 30 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.03}, spread=True),
+    'dead time 60 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.06}, spread=True),
     'dead time 10 ms, 60 ms assumed': Fault(assumed={'speed_filter.dead_time': 0.06}),
     # robot
     'wheel radii + 2 %, - 1 %': Fault(
@@ -368,15 +381,26 @@ class Job(NamedTuple):
 def run_job(job: Job) -> Row:
     """Return the job, its numbers, and what the diagnostics said when."""
     fault = FAULTS[job.fault]
-    events = [
-        FaultEvent(BEGIN, name, value, fault.lasting) for name, value in fault.events.items()
-    ]
+    changes: dict[str, Any] = {**fault.changes}
+    values = {**fault.events}
+    if fault.spread:
+        more = float(np.random.default_rng(job.seed).uniform(-0.5, 0.5)) / RATE
+        if 'command_delay' in values:
+            values['command_delay'] += more
+        else:
+            changes['drive.dead_time'] = changes.get('drive.dead_time', DEAD_TIME) + more
+    events = [FaultEvent(BEGIN, name, value, fault.lasting) for name, value in values.items()]
     method: Any = methods_for('twin')[job.controller]
     links = fault.links if isinstance(method, NodeMethod) else fault.forward_links or fault.links
-    own = OwnParts(robot_parameters=fault.changes, events=events, links=links)
+    own = OwnParts(robot_parameters=changes, events=events, links=links, assumed=fault.assumed)
     scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
     if isinstance(method, NodeMethod):
-        method = Watched(NodeMethod(job.controller, {**method.changes, **fault.assumed}))
+        method = Watched(method)
+    elif lag := fault.assumed.get('speed_filter.lag'):
+        advance = 1.0 / RATE / -math.expm1(-1.0 / RATE / lag)
+        parameters = method.parameters
+        if isinstance(parameters, FeedForwardParameters):
+            method = replace(method, parameters=parameters.with_values({'advance': advance}))
     with patch.object(loop, 'ReportLink', partial(Link, fault.send)):
         numbers = measure(loop.run(scenario, method))
     said = method.made[0].said if isinstance(method, Watched) else []

@@ -86,7 +86,7 @@ BLOCK_TIME, BLOCK_MAX_TIME = 0.25, 2.0
 """Duration of a block with enough information, and of any block, s."""
 BLOCK_DEVIATION = 0.012  # standard deviation from one block that has enough information, s
 ADOPTION_TIME = 15.0  # driving time after which a changed response is adopted, s
-CHANGE_TIME, CHANGE_FIT = 5.0, 1.1
+CHANGE_TIME, CHANGE_FIT = 3.5, 1.1
 """The same (s) where one dead time explains it as well, up to this factor of the squared errors,
 as the estimate explains what is accepted: late commands of a busy machine have no such time."""
 RETURN_TIME, RETURN_DIFFERENCE = 1.5, 0.008

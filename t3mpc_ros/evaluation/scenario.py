@@ -126,6 +126,9 @@ class OwnParts:
     """``noise`` is given with it."""
     robot_parameters: Mapping[str, Any] = field(default_factory=dict)
     """Changes of the true robot, unknown to all methods."""
+    assumed: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of the parameters of the node on the twin, from which all methods have the lag, the
+    dead time and the noise of the drive."""
     pauses: Sequence[tuple[float, float]] = ()
     """Times at which a person disables and re-enables the driver, s."""
     text: str = ''
@@ -375,6 +378,7 @@ class TwinKind(RobotKind):
                 'speed_filter.noise_variance': float(scenario.noise),
                 'body.gyro_scale_tolerance': stated,
                 **values,
+                **scenario.own.assumed,
             }
         )
 

@@ -33,8 +33,18 @@ def test_each_fault_fits_the_robot_and_the_controller():
     for fault in FAULTS.values():
         for name, value in fault.events.items():
             FaultEvent(fault.begin, name, value, fault.lasting)
-        scenario = Scenario('twin', 'nominal', 1, own=OwnParts(robot_parameters=fault.changes))
-        NodeMethod(FULL, fault.assumed).parameters_for(scenario)
+        own = OwnParts(robot_parameters=fault.changes, assumed=fault.assumed)
+        NodeMethod(FULL, {}).parameters_for(Scenario('twin', 'nominal', 1, own=own))
+
+
+def test_what_is_assumed_wrongly_is_assumed_by_every_method(monkeypatch):
+    """Simple methods once knew the dead time that the controller was told wrongly."""
+    monkeypatch.setattr(fault_comparison, 'DURATION', 12.0)
+    wrong, right = (
+        run_job(Job(name, FEED_FORWARD, 2001))['overall']
+        for name in ('dead time 10 ms, 60 ms assumed', 'none')
+    )
+    assert wrong > 4.0 * right
 
 
 @pytest.mark.parametrize(
