@@ -238,14 +238,14 @@ FAULTS: Mapping[str, Fault] = {
     'gyro bias - 0.01 rad/s': Fault(events={'gyro_bias_jump': -0.01}, begin=BEGIN),
     'gyro bias + 0.35 rad/s': Fault(events={'gyro_bias_jump': 0.35}, begin=BEGIN),
     'gyro dead': Fault(events={'gyro_dead': True}, begin=BEGIN),
-    'gyro scale + 3 %, stated': Fault(changes={'imu.gyro_scale_error': 0.03}),
+    'gyro scale within ± 3 %, stated': Fault(changes={'imu.gyro_scale_error': 0.03}),
     # No signal can tell it from wheels that are nearer by as much; only LMS follows the gyro, too.
-    'gyro scale + 1 %, not stated': Fault(
+    'gyro scale within ± 1 %, not stated': Fault(
         changes={'imu.gyro_scale_error': 0.01},
         assumed={'body.gyro_scale_tolerance': 0.001},
         comparable=(LMS,),
     ),
-    'gyro scale + 3 %, not stated': Fault(
+    'gyro scale within ± 3 %, not stated': Fault(
         changes={'imu.gyro_scale_error': 0.03},
         assumed={'body.gyro_scale_tolerance': 0.001},
         comparable=(LMS,),

@@ -34,7 +34,7 @@ from t3mpc_ros.control.control_law import (
     fitting_gain,
     servo_gain,
 )
-from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.dead_time_estimator import USED_EVIDENCE, DeadTimeEstimator
 from t3mpc_ros.control.input_shaper import EARLY, HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
@@ -96,10 +96,6 @@ MIN_DEAD_TIME_CHANGE = 0.0005  # smallest change (s) of the dead time in use
 
 NO_DEAD_TIME = 0.001
 """Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
-TOO_FAST = 8.0
-"""Likelihood ratio, 2 log, of a response before the lag has passed above which the lag in use is
-too long: that of 2.8 standard deviations."""
-
 MAX_MISSED = 20  # largest number of periods without a step through which a ramp goes on
 
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
@@ -926,7 +922,7 @@ class Controller:
         if self._excess_lag > 0.0 or estimator.dead_time > NO_DEAD_TIME:
             return False
         configured = self.parameters.speed_filter.dead_time
-        return estimator.evidence_against(configured) > TOO_FAST
+        return estimator.evidence_against(configured) > USED_EVIDENCE
 
     def _make_dead_time_estimator(self) -> DeadTimeEstimator:
         # The pulses of a stepper ramp over a period, half a period late on average.

@@ -55,9 +55,9 @@ GRID_SIZE = 31
 PRIOR_DEVIATION = 0.03  # standard deviation of the configured dead time, s
 IDENTIFIED_DEVIATION = 0.005
 """Standard deviation at and below which the dead time is identified, s."""
-USED_DIFFERENCE, USED_DEVIATIONS = 0.004, 3.0
-"""Difference (s), and its multiple of the standard deviation, up to which the configured dead time
-is kept: so much the estimate is off if the drive responds otherwise than the lag describes."""
+USED_DIFFERENCE, USED_EVIDENCE = 0.004, 7.0
+"""Difference (s), and likelihood ratio, 2 log, up to which the configured dead time is kept: so
+much the estimate is off if the drive responds otherwise than the lag describes."""
 MIN_DEVIATION = 0.0005
 """Standard deviation at which older data is forgotten as newer data is accepted, s."""
 UNCERTAINTY_FACTOR = 2.0
@@ -226,7 +226,8 @@ class DeadTimeEstimator:
         grid = GRID_STEP * np.arange(GRID_SIZE)
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
-        self._update = TypedKernel(update_dead_time)
+        self._update, self._evidence = TypedKernel(update_dead_time), TypedKernel(evidence_against)
+        self.evidence_against(prior)  # compiles it, which no step has to
         self.reset(np.zeros(2))
 
     @property
@@ -243,8 +244,10 @@ class DeadTimeEstimator:
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
         dead_time: float = self._state['dead_time'].item() - self.lateness
-        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * self._state['deviation'].item())
-        return dead_time if abs(dead_time - self._configured) > clear else self._configured
+        if abs(dead_time - self._configured) <= USED_DIFFERENCE:
+            return self._configured
+        clear = self.evidence_against(self._configured + self.lateness) > USED_EVIDENCE
+        return dead_time if clear else self._configured
 
     @property
     def standard_deviation(self) -> float:
@@ -256,13 +259,7 @@ class DeadTimeEstimator:
 
         The best one may be below 0, where the parabola of the smallest dead times has its minimum.
         """
-        estimate = self.estimate
-        costs = estimate.accepted.costs
-        slope, curvature = parabola(costs, 1)
-        _, least, _ = minimum(costs)
-        if slope > curvature > 0.0:
-            least = costs[1] - 0.5 * slope**2 / curvature
-        return float((cost_at(costs, dead_time) - least) / estimate.noise_ratio)
+        return self._evidence(self._state, dead_time)
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
@@ -315,6 +312,18 @@ def update_dead_time(
     if enough and duration >= BLOCK_TIME:
         assess_block(estimate, SERVO_DRIFT_BOUND if drive.friction else DRIFT_BOUND)
     return bool(estimate.disturbed)
+
+
+@kernel
+def evidence_against(state: Any, dead_time: float) -> float:
+    """Do :meth:`DeadTimeEstimator.evidence_against`; ``state`` as of :func:`update_dead_time`."""
+    estimate = state[0]
+    costs = estimate.accepted.costs
+    slope, curvature = parabola(costs, 1)
+    _, least, _ = minimum(costs)
+    if slope > curvature > 0.0:
+        least = costs[1] - 0.5 * slope**2 / curvature
+    return float((cost_at(costs, dead_time) - least) / estimate.noise_ratio)
 
 
 @kernel

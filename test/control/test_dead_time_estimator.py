@@ -21,6 +21,8 @@ from scipy.signal import lfilter
 from support.long_tests import few_of
 
 from t3mpc_ros.control.dead_time_estimator import (
+    GRID_SIZE,
+    GRID_STEP,
     IDENTIFIED_DEVIATION,
     MAX_DEAD_TIME,
     MIN_NOISE_VARIANCE,
@@ -421,6 +423,23 @@ def test_small_differences_keep_the_configured_dead_time():
         (0.02, 0.008, 0.03),
         (0.02, 0.006, 0.05),
     ):
-        estimator.estimate.dead_time = 0.03 + difference
-        estimator.estimate.deviation = deviation
+        shown(estimator, 0.03 + difference, deviation)
         assert estimator.dead_time_in_use == pytest.approx(used, abs=1e-12)
+
+
+def test_an_estimate_at_the_end_of_the_grid_is_as_certain_as_its_likelihood():
+    """Exact robots (5 of 60) were said to have no dead time: the curve at 0 had the deviation."""
+    estimator = DeadTimeEstimator(SpeedFilterParameters(lag=LAG, dead_time=0.01), PERIOD)
+    shown(estimator, 0.0, 0.005)
+    estimator.estimate.deviation = 0.0025
+    assert estimator.dead_time_in_use == 0.01
+    shown(estimator, 0.0, 0.003)
+    assert estimator.dead_time_in_use == 0.0
+
+
+def shown(estimator, dead_time, deviation):
+    """Make the data of an estimator show a dead time (s) with a standard deviation (s)."""
+    estimate = estimator.estimate
+    estimate.dead_time, estimate.deviation = dead_time, deviation
+    grid = GRID_STEP * np.arange(GRID_SIZE)
+    estimate.accepted.costs = estimate.noise_ratio * ((grid - dead_time) / deviation) ** 2
