@@ -155,8 +155,8 @@ CASES: Mapping[str, Case] = {
         'radius of the right wheel +5 %', right_wheel_radius_multiplier=1.05
     ),
     'gyro scale +3 %': _gyro(
-        'the scale of the gyro is off by up to 3 %, drawn for each seed, and this bound of its data '
-        'sheet is stated',
+        'the scale of the gyro is off by up to 3 %, drawn for each seed: the bound that its data '
+        'sheet states',
         changes={'imu.gyro_scale_error': 0.03},
     ),
     'gyro bias jump': _gyro(
