@@ -427,7 +427,7 @@ def test_small_differences_keep_the_configured_dead_time():
         assert estimator.dead_time_in_use == pytest.approx(used, abs=1e-12)
 
 
-def test_an_estimate_at_the_end_of_the_grid_is_as_certain_as_its_likelihood():
+def test_an_estimate_of_no_dead_time_is_as_certain_as_others():
     """Exact robots (5 of 60) were said to have no dead time: the curve at 0 had the deviation."""
     estimator = DeadTimeEstimator(SpeedFilterParameters(lag=LAG, dead_time=0.01), PERIOD)
     shown(estimator, 0.0, 0.005)
