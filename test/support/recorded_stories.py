@@ -37,6 +37,8 @@ SLIP_STOP = (
     'motion for 0.5 s to resume'
 )
 SKIPPED = 'processor overloaded: samples were skipped'
+TWO_PUBLISHERS = '/cmd_vel has 2 publishers: /controller, /other; stop all but one'
+KILLED = 'one that was killed leaves this list within 20 s'
 TWIN = {
     'sim_robot': {
         'wheel_radius': str(RADIUS), 'wheel_separation': str(SEPARATION), 'world': '',
@@ -81,6 +83,7 @@ class Story:
     names: dict = field(default_factory=dict)
     """Other names of topics."""
     second_robot: bool = False
+    second_controller: bool = False
     switches: tuple = ()
     """Times at which the reference switches, s."""
     rate: float = 50.0
@@ -118,6 +121,8 @@ class Story:
             if self.second_robot and k % 2:
                 other = serialised_odometry(stamp + 5_000_000, (0.1, 0.0), (5.0, 0.001 * k, 0.0))
                 rows.append((received + 6e-3, '/odom', other))
+            if self.second_controller:
+                rows.append((received + 6e-3, '/cmd_vel', serialised_twist((0.0, 0.1))))
         for mode, t in enumerate((0.0, *self.switches) if self.switches else ()):
             rows.append((max(t - LEAD, 1e-4), '/reference/signals', _signals(mode)))
         for second in range(1, round(DURATION)):
@@ -289,6 +294,20 @@ STORIES = {
         r'The position of /odom jumps between its messages: several robots publish it, or its '
         r'pose disagrees with its twist; nothing measured from it is valid\.', 'bad',
         second_robot=True, names={'/ground_truth/odom': ''},
+    ),
+    'two controllers': Story(
+        rf'/cmd_vel holds the commands of two publishers in turn; {SETTLED}\.', 'bad',
+        second_controller=True,
+    ),
+    'two controllers that agree': Story(
+        rf'/cmd_vel has 2 publishers; {SETTLED}\.', 'bad', reports=(
+            (3.0, 'sim_robot', WARNING, f'{TWO_PUBLISHERS}; {KILLED}'),
+            (5.0, 'sim_robot', WARNING, f'{SKIPPED}; {TWO_PUBLISHERS}'),
+        ),
+    ),
+    'a controller that was killed': Story(
+        rf'Good run: {SETTLED}, and the robot never stood\.', 'good',
+        reports=((3.0, 'controller', WARNING, f'{TWO_PUBLISHERS}; {KILLED}'),),
     ),
 }  # fmt: skip
 """By name."""

@@ -37,6 +37,9 @@ MIXED_SHARE = 0.1
 """Share of such messages from which on a topic holds several robots."""
 MIN_JUMPS = 10
 """Jumps up to which they are outliers, whatever their share."""
+ALTERNATING = 3.0
+"""How many times nearer a command of two publishers in turn is to the last but one than to the
+last."""
 _MAX_LISTED = 5
 
 
@@ -77,6 +80,13 @@ def pose_jumps(
     allowed = np.where(rests, min(least, REST_JUMP), least)
     rows = np.flatnonzero(away > allowed + SPEED_MARGIN * fastest * intervals)
     return list(zip((rows + 1).tolist(), away[rows].tolist(), strict=True))
+
+
+def alternate(commands: Array) -> bool:
+    """Return whether most commands, shape (n, 2), are those of two publishers in turn."""
+    step, two = (np.sum(np.abs(commands[k:] - commands[:-k]), axis=1) for k in (1, 2))
+    rows = step[1:] > ALTERNATING * two
+    return bool(np.count_nonzero(rows) > max(MIN_JUMPS, 0.5 * rows.size))
 
 
 def continuity_notes(

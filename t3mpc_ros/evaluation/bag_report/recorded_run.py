@@ -31,6 +31,7 @@ from t3mpc_ros.evaluation.bag_report.motion_continuity import (
     MIN_JUMPS,
     MIXED_SHARE,
     MIXED_STEP,
+    alternate,
     continuity_notes,
     gaps,
     other_units,
@@ -188,6 +189,8 @@ class Run:
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
     map_changes: tuple[RecordedChange, ...] = ()
+    publishers: Mapping[str, bool] = field(default_factory=dict)
+    """Sentences on motions with several publishers, and whether several are seen to publish."""
     other_clock: bool = False
     """Whether the stamps are of another clock than the receive times, as with simulated time."""
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -270,6 +273,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         untrusted=tuple(untrusted),
         world=records.get('sim_robot', {}).get('world', ''),
         map_changes=read_map_changes(recording, choice.namespaces[0], clock.local),
+        publishers=_publishers(recording, topics, motions, complaints),
         other_clock=clock.other,
         parameters=records,
         follows_path=records.get('controller', {}).get('pose.enabled', '').lower() == 'true',
@@ -310,6 +314,37 @@ def _oddities_of_bag(
         if count > 1:
             found.append(f'{topic_name} has {count} publishers.')
     return found, damage
+
+
+def _publishers(
+    recording: BagReader,
+    topics: Mapping[str, str],
+    motions: Mapping[str, Series],
+    complaints: Iterable[diagnostic_history.DiagnosticEvent],
+) -> dict[str, bool]:
+    """Return the topics of motions with several publishers; see :attr:`Run.publishers`.
+
+    That several publish is seen by a node which receives both, or from commands that alternate
+    and are more than one to a message of odometry: a controller may alternate as well.
+    """
+    found: dict[str, bool] = {}
+    for name in motions:
+        count = len(recording.topics[topics[name]].offered_qos_profiles)
+        seen = [
+            text.partition(f'{topics[name]} has ')[2].split(' ')[0]
+            for *_, text in complaints
+            if f'{topics[name]} has ' in text
+            and 'stop all but one' in text
+            and 'one that was killed' not in text
+        ]
+        if seen or count > 1:
+            found[f'{topics[name]} has {max(seen, default=str(count))} publishers'] = bool(seen)
+    command, odometry = motions.get(COMMAND), motions.get(ODOMETRY)
+    if found or command is None or len(command) <= 1.5 * len(odometry or ()):
+        return found
+    if alternate(np.column_stack([command['linear'], command['angular']])):
+        found[f'{topics[COMMAND]} holds the commands of two publishers in turn'] = True
+    return found
 
 
 def _oddities_of_motions(

@@ -14,8 +14,9 @@
 """The verdict on a recorded run: what happened in it, and whether its numbers measure something.
 
 One sentence, the same in the terminal, on the page and in the report. What happened comes first,
-in this order: a recording that cannot be trusted, nothing to judge, a stop, a blocked wheel, a
-gap, a condition of the robot, a jump, a machine too slow, an error that is too large.
+in this order: a recording that cannot be trusted, several publishers of a topic, nothing to judge,
+a stop, a blocked wheel, a gap, a condition of the robot, a jump, a machine too slow, an error that
+is too large.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -64,6 +65,8 @@ MIN_ON_PATH = 0.02
 obstacles, looking around and the way back are no errors; the path itself goes on meanwhile."""
 MOSTLY = 0.5
 """Share of the drive on the path below which the verdict says so."""
+
+SINGLE_PUBLISHER = 'Stop all publishers but one, or give each robot a namespace.'
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,9 @@ def judge(
     """
     findings = [_Finding(text, '', remedy, spoils=True) for text, remedy in run.damage.items()]
     damaged = bool(findings)
+    if several := run.publishers:
+        text, spoils = ', '.join(several), any(several.values())
+        findings.append(_Finding(text, 'Several publishers', SINGLE_PUBLISHER, spoils))
     lacking = _lacking(run)
     if run.measured in run.untrusted:
         return _verdict(run, findings, '', judged=not lacking, damaged=True)
