@@ -50,8 +50,8 @@ class CdrLayout:
 
 
 CDR_LAYOUTS: Mapping[str, CdrLayout] = {
-    # x, y, quaternion x, y, z, w, linear x, angular z
-    'nav_msgs/msg/Odometry': CdrLayout(True, 2, (0, 1, 3, 4, 5, 6, 43, 48)),
+    # x, y, quaternion x, y, z, w, linear x, angular z, linear y
+    'nav_msgs/msg/Odometry': CdrLayout(True, 2, (0, 1, 3, 4, 5, 6, 43, 48, 44)),
     # linear x and angular z
     'geometry_msgs/msg/Twist': CdrLayout(False, 0, (0, 5)),
     'geometry_msgs/msg/TwistStamped': CdrLayout(True, 1, (0, 5)),

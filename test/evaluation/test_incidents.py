@@ -22,13 +22,14 @@ from support.report_run import RUN
 from t3mpc_ros.evaluation.bag_report.incidents import (
     STALL_PERIODS,
     find_blocked_wheels,
+    find_carried,
     find_incidents,
     find_slips,
     find_stalls,
     find_stops,
 )
 from t3mpc_ros.evaluation.bag_report.recorded_run import Series, Timing
-from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
 TIME = 0.01 * np.arange(4000)
@@ -37,13 +38,19 @@ BRAKING = 0.1
 ESTOP = 'error', 'robot', 'emergency stop: a'
 
 
-def motion(right, left):
-    """Return the motion of wheel speeds, rad/s."""
+def motion(right, left, turned=0.0):
+    """Return the motion of wheel speeds, rad/s, of a robot that is turned besides, rad."""
     linear = 0.5 * GEOMETRY.wheel_radius * (right + left)
     angular = GEOMETRY.wheel_radius * (right - left) / GEOMETRY.wheel_separation
-    x = 0.01 * np.cumsum(linear)
+    yaw = 0.01 * np.cumsum(angular) + turned
+    x, y = (0.01 * np.cumsum(linear * each(yaw)) for each in (np.cos, np.sin))
     values = {'linear': linear, 'angular': angular, 'right': right, 'left': left}
-    return Series(TIME, values | {'x': x, 'y': 0.0 * x, 'yaw': 0.0 * x})
+    return Series(TIME, values | {'x': x, 'y': y, 'yaw': yaw})
+
+
+def moved(series, **changes):
+    """Return a motion with other values."""
+    return replace(series, values={**series.values, **changes})
 
 
 def wheels(rng):
@@ -193,6 +200,65 @@ def test_a_slip_lasts_until_its_node_says_otherwise():
     run = replace(run_of(speeds, speeds), changes=changes)
     end = max(series.time[-1] for series in run.motions.values())
     assert find_slips(run) == ((4.0, 6.0), (8.0, end))
+
+
+@pytest.mark.parametrize('seconds', [0.01, 0.5, 2.0, 5.0])
+@pytest.mark.parametrize('name', [ODOMETRY, TRUTH])
+def test_a_robot_that_is_carried_or_turned_is_found(name, seconds):
+    speeds = wheels(np.random.default_rng(6))
+    run = run_of(speeds, speeds)
+    drive = run.motions[ODOMETRY]
+    share = np.clip((TIME - 12.0) / seconds, 0.0, 1.0)
+    motions = {**run.motions, TRUTH: drive}
+    carried = moved(drive, x=drive['x'] + 0.9 * share), 'moves by 0.9'
+    turned = motion(*speeds, 1.6 * share), 'turns by 1.'
+    for shown, text in (carried, turned) if seconds < 5.0 else (carried,):
+        (found,) = find_carried(replace(run, motions={**motions, name: shown}))
+        assert (found.name, found.against) == (name, 'its twist')
+        assert 12.0 <= found.time <= 12.02 + 0.8 * seconds
+        assert text in found.text
+    # What both measure is the motion of the robot; what odometry does not see is not.
+    lifted = {part: drive[part] + 0.6 * share for part in 'xy'}
+    still = {'linear': 0.0 * TIME, 'angular': 0.0 * TIME}
+    both = {**motions, TRUTH: moved(drive, **lifted, **still), ODOMETRY: moved(drive, **still)}
+    if 0.01 < seconds < 5.0:  # less is a jump of a robot at rest
+        (found,) = find_carried(replace(run, motions=both))
+        assert (found.name, found.against) == (TRUTH, ODOMETRY)
+    same = {**both, ODOMETRY: both[TRUTH]}
+    assert find_carried(replace(run, motions=same)) == ()
+
+
+def test_noise_outliers_strafing_and_the_localizer_carry_nothing():
+    rng = np.random.default_rng(7)
+    speeds = [2.0 * each for each in wheels(rng)]
+    noisy = [each + rng.normal(0.0, 0.4, TIME.size) for each in speeds]
+    run = run_of(speeds, speeds)
+    drive, lateral = run.motions[ODOMETRY], 0.4 * np.sin(0.5 * TIME)
+    pose = {part: drive[part] + rng.normal(0.0, 0.03, TIME.size) for part in ('x', 'y', 'yaw')}
+    outliers = {'x': drive['x'] + 0.9 * (rng.uniform(size=TIME.size) < 0.01)}
+    sideways = {
+        'x': drive['x'] - 0.01 * np.cumsum(lateral * np.sin(drive['yaw'])),
+        'y': drive['y'] + 0.01 * np.cumsum(lateral * np.cos(drive['yaw'])),
+        'lateral': lateral,
+    }
+    no_pose = dict.fromkeys(('x', 'y', 'yaw'), 0.0 * TIME)
+    slow = Series(TIME[::30], {key: each[::30] for key, each in drive.values.items()})
+    for shown in (
+        moved(motion(*noisy), **pose), moved(drive, **outliers), moved(drive, **sideways),
+        moved(drive, **no_pose), moved(drive, yaw=0.0 * TIME), slow,
+    ):  # fmt: skip
+        assert find_carried(replace(run, motions={**run.motions, ODOMETRY: shown})) == ()
+    corrected = {**run.motions, ODOMETRY: moved(drive, x=drive['x'] + 0.9 * (TIME > 9.0))}
+    assert find_carried(replace(run, motions=corrected))
+    assert not find_carried(replace(run, motions=corrected, parameters={'localizer': {}}))
+
+
+def test_a_twist_of_the_opposite_sign_is_no_event():
+    speeds = wheels(np.random.default_rng(8))
+    run = run_of(speeds, speeds)
+    wrong = moved(run.motions[ODOMETRY], linear=-run.motions[ODOMETRY]['linear'])
+    (found,) = find_carried(replace(run, motions={ODOMETRY: wrong}))
+    assert 'see signs, units and frames' in found.text
 
 
 def test_nothing_happens_in_a_run_without_an_incident():

@@ -104,6 +104,9 @@ def stand_outside(i, t, message):
     if not 3.0 < t < 13.0:
         twist = message.twist.twist if hasattr(message, 'twist') else message
         twist.linear.x = twist.angular.z = 0.0
+        if hasattr(message, 'pose'):
+            places = [(abs(r - min(max(t, 3.0), 13.0)), m.pose) for r, n, m in only('/odom')]
+            message.pose = min(places, key=lambda each: each[0])[1]
 
 
 def second_robot(pose=(0.0, 0.0, 0.0)):

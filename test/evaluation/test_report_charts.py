@@ -283,6 +283,11 @@ ESTOP = (5.0, 'error', 'robot', 'emergency stop: a')
 LATE = r'The machine was slow: 99 % of the commands came within 11\.0 ms of their odometry, .*'
 
 
+def verdict_on(run, **given):
+    """Return a verdict. The poses of these runs do not belong to their speeds."""
+    return judge(run, replace(find_incidents(run), carried=()), **(JUDGED | given))
+
+
 def shifted(**wheels):
     """Return motions whose wheels have these errors, rad/s."""
     found = {w: motion(REFERENCE, w) + wheels.get(w, 0.0) for w in WHEELS}
@@ -361,7 +366,7 @@ ZERO = {**FOLLOWING, COMMAND: Series(TIME, {k: 0.0 * v for k, v in COMMANDED.ite
 )  # fmt: skip
 def test_each_verdict_in_words_and_its_limit(run, given, sentence, kind, sound):
     run = replace(QUIET, **run)
-    verdict = judge(run, find_incidents(run), **(JUDGED | given))
+    verdict = verdict_on(run, **given)
     assert re.fullmatch(sentence, verdict.sentence), verdict.sentence
     assert (verdict.kind, verdict.sound) == (kind, sound)
     late = [each for each in verdict.reasons() if re.fullmatch(LATE, each)]
@@ -376,7 +381,7 @@ def test_what_happened_besides_follows_with_the_remedy():
         (5.3, 'error', 'radio_bridge', 'emergency stop: a'),
     )
     run = replace(QUIET, motions=standing(5.0, 9.0), changes=changes)
-    verdict = judge(run, find_incidents(run), **(JUDGED | {'missing': 0.5}))
+    verdict = verdict_on(run, missing=0.5)
     assert verdict.label == 'E-stop at 5.0 s'
     assert verdict.remedy.startswith('When the way is clear, release it')
     assert verdict.reasons()[1:] == ['50.0 % of odom is missing.']
@@ -403,7 +408,7 @@ def test_a_poor_run_is_far_worse_than_what_its_robot_reaches():
     for ratio, label in ((0.99 * MAX_RATIO, 'Good run'), (1.01 * MAX_RATIO, 'Poor run')):
         error = ratio * KNOWN_RMSE
         run = replace(QUIET, motions=shifted(left=error), parameters=KNOWN_PARAMETERS)
-        found = judge(run, find_incidents(run), **JUDGED)
+        found = verdict_on(run)
         assert (found.label, found.sound) == (label, label == 'Good run')
     assert f'{1.01 * MAX_RATIO:.0f} times the {KNOWN_RMSE:g} rad/s' in found.sentence
 

@@ -290,6 +290,12 @@ STORIES = {
         rf'2 jumps; {SETTLED}\.', 'open', moved=lambda t: 3.0 * (t >= 8.0),
         reports=((5.0, 'sim_robot', WARNING, SKIPPED),),
     ),
+    'carried': Story(
+        r'The pose of (odom|ground_truth/odom) moves by 1(\.\d+)? m at 8\.\d s, which its twist '
+        r'does not say: the robot was carried or slipped, or its pose was set; '
+        rf'{SETTLED}\.', 'open',
+        moved=lambda t: min(max(0.5 * (t - 8.0), 0.0), 1.0),
+    ),
     'two robots': Story(
         r'The position of /odom jumps between its messages: several robots publish it, or its '
         r'pose disagrees with its twist; nothing measured from it is valid\.', 'bad',

@@ -22,7 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
-from t3mpc_ros.evaluation.bag_report.motion_continuity import MIN_GAP, gaps, pose_jumps
+from t3mpc_ros.evaluation.bag_report.motion_continuity import (
+    DISPLACED_WINDOW,
+    MIN_GAP,
+    Displacement,
+    displacements,
+    gaps,
+    pose_jumps,
+)
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series, moves
 from t3mpc_ros.evaluation.run_record import spans_of
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
@@ -53,6 +60,8 @@ WHEEL_STILL, WHEEL_DEMANDED = 0.2, 0.8
 """Smoothed speed of a wheel that stands, and least command to one that is to turn, rad/s."""
 BLOCKED_TIME = 1.0
 """Least duration of a standstill of one wheel, s: longer than a slow drive crosses zero."""
+LASTING = 10.0
+"""Time from which on a pose that moves otherwise than its twist is no event, s."""
 MIN_STALL = 0.02
 """Least length of a stall, s: receipts of fast robots jitter by as much."""
 
@@ -80,6 +89,32 @@ class Jump(NamedTuple):
     """m"""
 
 
+class Carried(NamedTuple):
+    """A motion of a robot that another measurement does not explain."""
+
+    time: float
+    name: str
+    """Relative name of the topic."""
+    against: str
+    """What says otherwise."""
+    motion: Displacement
+
+    @property
+    def text(self) -> str:
+        """What happened, without a full stop."""
+        _, duration, distance, turn = self.motion
+        if duration > LASTING:
+            return (
+                f'the pose of {self.name} moves otherwise than {self.against} says from '
+                f'{self.time:.1f} s on for {duration:.0f} s: see signs, units and frames'
+            )
+        how = f'moves by {distance:.3g} m' if distance > 0.5 * turn else f'turns by {turn:.3g} rad'
+        return (
+            f'the pose of {self.name} {how} at {self.time:.1f} s, which {self.against} does not '
+            'say: the robot was carried or slipped, or its pose was set'
+        )
+
+
 @dataclass(frozen=True)
 class Incidents:
     """What interrupted a run, each in order of time, s."""
@@ -93,6 +128,7 @@ class Incidents:
     """Start and end of each time in which one wheel stood although it was commanded to turn, while
     the other one turned, and which."""
     jumps: tuple[Jump, ...] = ()
+    carried: tuple[Carried, ...] = ()
     slips: tuple[Span, ...] = ()
     """Times in which the robot reported that a wheel slips."""
 
@@ -122,6 +158,7 @@ class Incidents:
             (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
             for jump in self.jumps
         ]
+        found += [(each.time, 'jump', each.text) for each in self.carried]
         slips = 'a wheel slips, is blocked, or has lost steps'
         found += [(start, 'slip', f'for {end - start:.1f} s {slips}') for start, end in self.slips]
         return sorted(found)
@@ -143,6 +180,7 @@ def find_incidents(run: Run) -> Incidents:
         ),
         find_blocked_wheels(run),
         find_jumps(run),
+        find_carried(run),
         find_slips(run),
     )
 
@@ -399,3 +437,61 @@ def find_jumps(run: Run) -> tuple[Jump, ...]:
             for k, away in pose_jumps(motion.time, places, motion['linear'])
         ]
     return tuple(sorted(found))
+
+
+def find_carried(run: Run) -> tuple[Carried, ...]:
+    """Return where a pose moves otherwise than its twist says, or ground truth than odometry.
+
+    The localizer of this package corrects the odometry by the map: then it counts for nothing.
+    """
+    motions = {
+        name: motion
+        for name in (TRUTH, ODOMETRY)
+        if (motion := run.motions.get(name)) is not None
+        and len(motion) > 2
+        and 'x' in motion.values
+        and name not in run.untrusted
+        and np.ptp(motion['yaw'])  # else it has no pose
+        and not (name == ODOMETRY and 'localizer' in run.parameters)
+    }
+    pairs = [
+        (name, 'its twist', each.time, _poses(each, each.time), _moves_by_twist(each))
+        for name, each in motions.items()
+        if each['linear'].any() and each['angular'].any()  # else there is no twist
+    ]
+    if len(motions) > 1:
+        truth = motions[TRUTH]
+        odometry = motions[ODOMETRY].between(float(truth.time[0]), float(truth.time[-1]))
+        time, moves = odometry.time, _moves_by_pose(odometry)
+        pairs.append((TRUTH, ODOMETRY, time, _poses(truth, time), moves))
+    times, found = [jump.time for jump in find_jumps(run)], []
+    for name, against, time, poses, moves in pairs:
+        for each in displacements(time, poses, moves):
+            low, high = each.start - DISPLACED_WINDOW, each.start + each.duration
+            if not any(low <= when <= high for when in times):  # one event is reported once
+                times.append(each.start)
+                found.append(Carried(each.start, name, against, each))
+    return tuple(sorted(found))
+
+
+def _poses(motion: Series, time: Array) -> Array:
+    """Return x, y (m) and yaw (rad) at some times, shape (n, 3)."""
+    axes = motion['x'], motion['y'], np.unwrap(motion['yaw'])
+    return np.column_stack([np.interp(time, motion.time, each) for each in axes])
+
+
+def _moves_by_twist(motion: Series) -> Array:
+    """Return how far a robot should move ahead, to the left and turn until its next message."""
+    lateral = motion.values.get('lateral', np.zeros(len(motion)))
+    twists = np.column_stack([motion['linear'], lateral, motion['angular']])
+    moves: Array = 0.5 * (twists[1:] + twists[:-1]) * np.diff(motion.time)[:, np.newaxis]
+    return moves
+
+
+def _moves_by_pose(motion: Series) -> Array:
+    """Return how far a robot moves ahead, to the left and turns until its next message."""
+    poses = _poses(motion, motion.time)
+    x, y, turn = np.diff(poses, axis=0).T
+    middle = 0.5 * (poses[1:, 2] + poses[:-1, 2])
+    c, s = np.cos(middle), np.sin(middle)
+    return np.column_stack([c * x + s * y, c * y - s * x, turn])

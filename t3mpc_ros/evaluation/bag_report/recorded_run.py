@@ -65,6 +65,7 @@ _ODOMETRY_FIELDS = {
     'w': 'pose.pose.orientation.w',
     'linear': 'twist.twist.linear.x',
     'angular': 'twist.twist.angular.z',
+    'lateral': 'twist.twist.linear.y',
 }
 SIGNAL_NAMES = ('mode', 'signal of the right wheel', 'signal of the left wheel')
 """Numbers of the topic of signals."""
@@ -160,7 +161,8 @@ class Run:
     """Channels of the motions: wheels with known geometry, else linear and angular speed."""
     motions: Mapping[str, Series]
     """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
-    right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad)."""
+    right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad) and
+    lateral (m/s)."""
     numbers: Mapping[str, Series]
     """Scalar topics by relative name and the signals by :data:`SIGNAL_NAMES`, as ``value``."""
     receipts: Mapping[str, Array]
@@ -543,7 +545,8 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | N
         values |= {'right': wheels.right, 'left': wheels.left}
     if 'x' in table:
         yaw = _yaw(table)
-        values |= {'x': table['x'][order], 'y': table['y'][order], 'yaw': yaw[order]}
+        values |= {name: table[name][order] for name in ('x', 'y', 'lateral')}
+        values['yaw'] = yaw[order]
     return Series(time, values)
 
 

@@ -123,7 +123,8 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
         verdict_box(figures.verdict),
     ]
     unusual, usual = _losses(recording, run)
-    if oddities := [*run.oddities, *unusual]:
+    carried = [f'{each.text[0].upper()}{each.text[1:]}.' for each in figures.incidents.carried]
+    if oddities := [*run.oddities, *carried, *unusual]:
         blocks.append(Items([[each] for each in oddities], title='Unusual in this bag'))
     blocks.append(Contents())
     first, soon = (FLOOR, SPEEDS) if run.follows_path else (SPEEDS, FLOOR)

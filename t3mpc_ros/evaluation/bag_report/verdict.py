@@ -134,7 +134,7 @@ def judge(
     if lacking:
         said = _Finding(_without(run, lacking), 'Data missing: tracking cannot be judged')
         if run.measured:
-            findings += _interruptions(run, incidents)
+            findings += [*_interruptions(run, incidents), *_jumps(incidents)]
         return _verdict(run, [*findings, said], said.text, judged=False, damaged=damaged)
     first, last = driving(run)
     if not first < last:
@@ -372,6 +372,12 @@ def _jumps(incidents: Incidents) -> Iterator[_Finding]:
         )
         text += f', the largest of {len(jumps)} jumps' if len(jumps) > 1 else ''
         yield _Finding(text, f'Jump of the position at {largest.time:.1f} s')
+    if carried := incidents.carried:
+        largest_of = max(carried, key=lambda each: each.motion.distance + each.motion.turn)
+        more = f', the largest of {len(carried)} such motions' if len(carried) > 1 else ''
+        yield _Finding(
+            f'{largest_of.text}{more}', f'Carried or slipped at {largest_of.time:.1f} s'
+        )
 
 
 # -- what was reached -----------------------------------------------------------------------------

@@ -232,7 +232,7 @@ def recorded_parameters(
 
 def motions(column: TopicColumns) -> StateArray:
     """Return odometry messages as states."""
-    x, y, qx, qy, qz, qw, linear, angular = column.numbers.T
+    x, y, qx, qy, qz, qw, linear, angular, _ = column.numbers.T
     with np.errstate(over='ignore', invalid='ignore'):
         sine = 2.0 * (qw * qz + qx * qy)
         cosine = 1.0 - 2.0 * (qy * qy + qz * qz)
