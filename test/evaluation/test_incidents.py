@@ -110,6 +110,13 @@ def test_a_robot_that_stands_because_it_is_to_is_not_stopped(delay):
     assert find_stops(replace(run, motions=motions)) == ()
 
 
+def test_a_robot_that_creeps_before_it_stands_does_not_stand_yet():
+    wanted = wheels(np.random.default_rng(3))
+    share = np.where(TIME < 20.0, 1.0, 0.0) * np.clip((20.0 - TIME) / 4.0, 0.1, 1.0)
+    (stop,) = find_stops(run_of(wanted, [share * each for each in wanted]))
+    assert stop.start == pytest.approx(20.0, abs=0.3)
+
+
 def test_a_drive_that_is_over_is_no_stop_unless_a_node_says_why():
     wanted = wheels(np.random.default_rng(4))
     moved = standing(wanted, [(30.0, 99.0)])

@@ -215,6 +215,27 @@ STORIES = {
             (12.0, 'controller', WARNING, 'the robot does not follow commands'),
         ),
     ),
+    'stands without a reason': Story(
+        rf'The robot stood for [78]\.\d s from 12\.[01] s on \(the nodes reported no reason\); '
+        rf'until then {SETTLED}\.', 'bad', stands=((12.0, 99.0),),
+        reports=(
+            (0.0, 'sim_robot', WARNING, 'no command yet'),
+            (2.0, 'sim_robot', OK, 'following commands'),
+        ),
+    ),
+    'never moves after it waited for commands': Story(
+        r'The robot never moved, although it was to for 19\.\d s\.', 'bad', stands=((-9.0, 99.0),),
+        reports=(
+            (0.0, 'sim_robot', WARNING, 'no command yet'),
+            (2.0, 'sim_robot', OK, 'following commands'),
+        ),
+    ),
+    'a second controller begins': Story(
+        r'The robot stood for 2\.\d s from 12\.[01] s on \(other: stopped: no reference yet, '
+        rf'although the bag holds reference of that time\); while it drove {SETTLED}\.', 'bad',
+        stands=((12.0, 14.0),),
+        reports=((12.0, 'other', ERROR_LEVEL, 'stopped: no reference yet'),),
+    ),
     'blocked wheel': Story(
         r'The right wheel stood from 1[12]\.\d s on for [56]\.\d s although it was commanded to '
         r'turn; settled RMSE .*\.', 'bad', blocked=((12.0, 18.0),),

@@ -13,7 +13,7 @@
 # limitations under the License.
 """Diagnostics over time: conditions of every node, and the histories of radio links."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -21,6 +21,8 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTERS, LINK_KEYS, SHARES, LinkHistory
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.geometry.types import Array
 
 _LEVELS = {0: 'ok', 1: 'warning', 2: 'error', 3: 'stale'}
 STANDSTILL = 'standstill'
@@ -34,20 +36,22 @@ MAX_CHANGES = 1000
 
 def read_diagnostics(
     recording: BagReader, namespace: str
-) -> tuple[list[DiagnosticEvent], list[DiagnosticEvent], list[LinkHistory]]:
+) -> tuple[list[DiagnosticEvent], list[DiagnosticEvent], list[LinkHistory], Array]:
     """Return what the nodes report, in ``/diagnostics`` and in that of the namespace.
 
     Each distinct warning or error with its first time; each state of a node that follows another
-    one of it, but not that it was well from the start; and the radio links.
+    one of it, but not that it was well from the start; the radio links; the times of all reports.
     """
     found: dict[tuple[str, str, str], float] = {}
     changes: list[DiagnosticEvent] = []
+    times: list[float] = []
     state: dict[str, tuple[int, str]] = {}
     rows: dict[str, list[tuple[float, dict[str, float]]]] = {}
     for topic in sorted({'/diagnostics', f'{namespace}/diagnostics'} & set(recording.topics)):
         if not recording.topics[topic].type_name.endswith('DiagnosticArray'):
             continue
         for received, message in recording.messages(topic):
+            times.append(received)
             for status in message.status:
                 level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
                 word, text = _LEVELS.get(level, str(level)), _text(status)
@@ -67,7 +71,8 @@ def read_diagnostics(
         }
         links.append(LinkHistory(name, np.array([when for when, _ in entries]), values))
     complaints = sorted(found.items(), key=lambda item: item[1])
-    return [(when, *key) for key, when in complaints], sorted(changes)[:MAX_CHANGES], links
+    described = [(when, *key) for key, when in complaints]
+    return described, sorted(changes)[:MAX_CHANGES], links, np.array(times)
 
 
 def _text(status: Any) -> str:
@@ -110,6 +115,8 @@ REASON_WINDOW = 1.5
 """Diagnostics come once a second: those of a stop are at most this far from its start, s."""
 REASON_LEAD = 0.5
 """Diagnostics of a cause are at most this far before the stop, s, or still hold then."""
+OVER = 3.0
+"""Time for which a robot may stand on after the cause of it is over, s."""
 
 
 class Cause(NamedTuple):
@@ -122,6 +129,8 @@ class Cause(NamedTuple):
     text: str = ''
     """What the nodes said."""
     source: int = MACHINE
+    lacks: str = ''
+    """Relative name of the topic that is said not to be received."""
 
     @property
     def known(self) -> bool:
@@ -136,6 +145,8 @@ class Pattern(NamedTuple):
     """What the diagnostics contain."""
     name: str
     remedy: str
+    lacks: str = ''
+    """Relative name of the topic that it says is not received."""
     stops: bool = True
     """Whether it stops the robot; else it is a condition under which it drives on."""
 
@@ -143,6 +154,7 @@ class Pattern(NamedTuple):
 SLIP = 'a wheel slips'
 """Part of the reports of a robot whose gyro and steps disagree."""
 _CHARGE = 'Charge the battery.'
+_SILENT = 'See why the controller fell silent.'
 OVERLOADED = 'The machine was overloaded'
 END_PROGRAMS = 'End other programs, or use a faster machine, and repeat the run.'
 PATTERNS = (
@@ -171,13 +183,13 @@ PATTERNS = (
         'Move the dongle nearer to it, or change the channel.',
     ),
     Pattern('dongle', 'The dongle did not answer', 'See its cable and its port.'),
-    Pattern('the last command has expired', 'No command', 'See why the controller fell silent.'),
-    Pattern('no command', 'No command', 'See why the controller fell silent.'),
+    Pattern('the last command has expired', 'No command', _SILENT, COMMAND),
+    Pattern('no command', 'No command', _SILENT, COMMAND),
     Pattern('disabled by request', 'Controller disabled', 'Enable it with ~/enable.'),
     Pattern(
         'reference is stale', 'Reference too old', 'See why the reference generator fell silent.'
     ),
-    Pattern('no reference yet', 'No reference', 'Start a reference generator.'),
+    Pattern('no reference yet', 'No reference', 'Start a reference generator.', REFERENCE),
     Pattern(
         'odom is too old',
         'Odometry too old',
@@ -186,7 +198,7 @@ PATTERNS = (
     Pattern(
         'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.'
     ),
-    Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
+    Pattern('no odometry', 'No odometry', 'See why the robot fell silent.', ODOMETRY),
     Pattern(
         'odometry is not finite',
         'Odometry is not finite',
@@ -227,17 +239,26 @@ def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
     if found and found.name == OVERLOADED:
         source = MACHINE
     if found is not None and found.stops == stops:
-        return Cause(found.name, found.remedy, f'{node}: {text}', source)
+        return Cause(found.name, found.remedy, f'{node}: {text}', source, found.lacks)
     if found is None and stops and level == 'error' and source != MACHINE:
         first = text.split('; ')[0]  # what follows is about something else
         return Cause(f'{node}: {first}', '', f'{node}: {text}', source)
     return None
 
 
-def cause_between(changes: Sequence[DiagnosticEvent], start: float, end: float) -> Cause:
+def cause_between(
+    changes: Sequence[DiagnosticEvent],
+    start: float,
+    end: float,
+    *,
+    present: Collection[str] = (),
+    reported: bool = False,
+) -> Cause:
     """Return the cause of a standstill from ``start`` to ``end``, s.
 
-    From what the nodes reported about its start, and from what still applied then.
+    From what the nodes reported about its start, and from what still applied then; unless the node
+    was well again while the robot stood on, or lacked a topic that was ``present``. ``reported``:
+    whether the bag holds diagnostics of that time.
     """
     until = max(math.nextafter(start, end), min(end, start + 10.0)) + REASON_WINDOW
     near = [each for each in changes if start - REASON_LEAD <= each[0] <= until]
@@ -245,9 +266,21 @@ def cause_between(changes: Sequence[DiagnosticEvent], start: float, end: float) 
     for each in changes:
         if each[0] < start - REASON_LEAD:
             active[each[2]] = each
-    found = [cause for each in [*near, *active.values()] if (cause := cause_of(each))]
-    if not found:
-        texts = [f'{node}: {text}' for _, level, node, text in near if level != 'ok']
-        words = '; '.join(dict.fromkeys(texts[:2]))
-        return Cause('', text=words or 'the bag holds no diagnostics of that time')
-    return min(found, key=lambda each: each.source)  # of equal ones the first
+    events = [each for each in [*near, *active.values()] if not _was_over(each, changes, end)]
+    found = [cause for each in events if (cause := cause_of(each))]
+    known = [each for each in found if each.lacks not in present]
+    if known:
+        return min(known, key=lambda each: each.source)  # of equal ones the first
+    texts = [f'{each.text}, although the bag holds {each.lacks} of that time' for each in found]
+    texts += [f'{node}: {text}' for _, level, node, text in near if level != 'ok' and not texts]
+    words = '; '.join(dict.fromkeys(texts[:2]))
+    none = 'the nodes reported no reason'
+    none = none if reported else 'the bag holds no diagnostics of that time'
+    return Cause('', text=words or none)
+
+
+def _was_over(event: DiagnosticEvent, changes: Sequence[DiagnosticEvent], end: float) -> bool:
+    """Return whether the next state of a node has no cause, long before a standstill ends."""
+    later = (each for each in changes if each[2] == event[2] and each[0] > event[0])
+    following = next(later, None)
+    return following is not None and following[0] < end - OVER and cause_of(following) is None

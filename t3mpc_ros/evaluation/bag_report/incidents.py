@@ -21,7 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
+    REASON_WINDOW,
+    SLIP,
+    Cause,
+    cause_between,
+)
 from t3mpc_ros.evaluation.bag_report.motion_continuity import (
     DISPLACED_WINDOW,
     MIN_GAP,
@@ -51,6 +56,8 @@ PAUSE = 0.5
 """Least duration of a standstill, s."""
 COMMAND_TIMEOUT = 0.5
 """Time without a command after which the robot stands, s."""
+MAX_PAUSE = 0.2
+"""Longest time between the messages of a topic that is received, s."""
 BRAKING = 0.5
 """Longest time from the begin of a stop to standstill, s; as ``max_stopping_time``."""
 STALL_PERIODS = 5.0
@@ -265,7 +272,11 @@ def standstills(motion: Series) -> list[Span]:
     found = []
     for each in spans_of(still_rows(linear, angular, HOLD)):
         if np.mean(still[each]) >= 0.5:
-            low, high = float(time[each][0]), float(time[each][-1])
+            # A robot that creeps before and after it does not stand.
+            balance = np.cumsum(np.where(still[each], 1, -1))
+            first = int(np.argmin(np.concatenate([[0], balance[:-1]])))
+            end = first + int(np.argmax(balance[first:]))
+            low, high = float(time[each][first]), float(time[each][end])
             middle = 0.5 * (low + high)
             found.append((_edge(motion, low, -1, middle), _edge(motion, high, 0, middle)))
     return merged(found)
@@ -327,11 +338,26 @@ def find_stops(run: Run) -> tuple[Stop, ...]:
         asked = asks_for_motion(demand, np.linspace(start, stop, 50))
         if not (start < stop and np.mean(asked) >= 0.5):
             continue
-        cause = cause_between(run.changes, start, stop)
+        cause = cause_between(
+            run.changes, start, stop, present=_present(run, start - BRAKING, stop),
+            reported=bool(np.any((run.reports > start) & (run.reports < stop + REASON_WINDOW))),
+        )  # fmt: skip
         if start >= last - PAUSE and not cause.known:
             continue
         found.append(Stop(start, stop, cause))
     return tuple(found)
+
+
+def _present(run: Run, start: float, end: float) -> list[str]:
+    """Return the topics that were received from one time to another without a pause."""
+    found = []
+    for name in (REFERENCE, ODOMETRY, COMMAND):
+        if name in run.motions:
+            time = run.motions[name].time - (run.lead if name == REFERENCE else 0.0)
+            inside = time[(time > start) & (time < end)]
+            if np.max(np.diff([start, *inside.tolist(), end])) < MAX_PAUSE:
+                found.append(name)
+    return found
 
 
 def _begin_of_stop(motion: Series, asked: Series, standstill: float) -> float:

@@ -180,6 +180,8 @@ class Run:
     """Sentences on what is unusual in the bag, and what was done about it."""
     remarks: tuple[str, ...]
     """Sentences on where the data come from."""
+    reports: Array = field(default_factory=lambda: np.empty(0))
+    """Receive times of diagnostics."""
     doubts: tuple[str, ...] = ()
     """Those of the oddities that concern the numbers of the messages."""
     damage: Mapping[str, str] = field(default_factory=dict)
@@ -243,7 +245,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
     oddities += _oddities_of_motions(topics, raw)
-    complaints, changes, links = diagnostic_history.read_diagnostics(
+    complaints, changes, links, reports = diagnostic_history.read_diagnostics(
         recording, choice.namespaces[0]
     )
     expected = NAMES if choice.ours else (REFERENCE, ODOMETRY, COMMAND)
@@ -268,6 +270,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         complaints=tuple(complaints),
         changes=tuple(changes),
         links=tuple(links),
+        reports=reports,
         oddities=tuple(dict.fromkeys(oddities)),
         remarks=tuple(notes),
         doubts=tuple(doubts),
