@@ -29,6 +29,7 @@ from mcap.writer import Writer
 from t3mpc_ros.atomic_file import atomic_file, sync_folder
 from t3mpc_ros.bag import mcap_file
 from t3mpc_ros.bag.errors import BagError
+from t3mpc_ros.bag.message_losses import LOSSES, damage_record
 from t3mpc_ros.bag.metadata_yaml import read_origin, write_metadata
 from t3mpc_ros.geometry.types import NANOSECONDS
 
@@ -343,6 +344,7 @@ class _FileRecovery:
             result.notes.append('the file has no end: the last chunk of its writer is not in it')
         self._count_losses()
         if self._writer:
+            self._write_losses()
             self._writer.finish()
         progress(result.name, result.size, result.size)
         return result
@@ -475,6 +477,15 @@ class _FileRecovery:
         lost = sum(topic.lost for topic in result.topics.values())
         if lost and result.clean:
             result.damages.append(Damage(0, 0, f'{lost} messages are missing'))
+
+    def _write_losses(self) -> None:
+        """Write what is lost beside the record of the recorder, which it may have as well."""
+        lost = {topic.name: topic.lost for topic in self._result.topics.values() if topic.lost}
+        damages = [each for each in self._result.damages if not each.harmless]
+        spans = [each.span_ns for each in damages if each.span_ns]
+        if self._writer and (lost or spans):
+            title = f'{LOSSES} in {self._result.name}'
+            self._writer.add_metadata(title, damage_record(lost, spans))
 
     def _verify_data_checksum(self, end: int, expected: int) -> None:
         """Verify the checksum of the data section, which covers records without a checksum."""

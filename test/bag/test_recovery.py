@@ -39,6 +39,7 @@ from support.long_tests import few_of
 from t3mpc_ros.bag import recovery
 from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
+from t3mpc_ros.bag.message_losses import lost_spans, message_losses
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import (
@@ -430,6 +431,16 @@ def test_complete_file_with_a_damaged_chunk_is_not_copied(tmp_path):
     result = recover_bag(path, tmp_path / 'new')
     assert not result.files[0].copied
     assert not result.clean
+    with open_bag(tmp_path / 'new') as bag:
+        records = bag.metadata_records
+    lost = {name: topic.lost for name, topic in result.topics.items() if topic.lost}
+    assert message_losses(records)['damaged'] == lost
+    assert sum(lost.values()) == result.lost > 0
+    assert lost_spans(records) == [each.span_ns for each in result.files[0].damages]
+    losses = {'losses': {'lost /a': '3'}, 'losses in b': {'damaged /a': '2', 'damaged': '2'}}
+    more = message_losses({**records, **losses})
+    assert more['lost'] == {'/a': 3}
+    assert more['damaged']['/a'] == lost.get('/a', 0) + 2
     assert result.lost + result.kept == 800
     assert result.lost_seconds < 1.0
     assert len(read_anyhow(tmp_path / 'new')) == result.kept

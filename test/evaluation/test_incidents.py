@@ -182,6 +182,20 @@ def test_a_lost_packet_is_no_stall():
     assert find_stalls(replace(run, receipts=slow))
 
 
+def test_lost_commands_and_damaged_parts_are_no_stall():
+    speeds = wheels(np.random.default_rng(1))
+    timing = {ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)}
+    some = np.random.default_rng(2).uniform(size=TIME.size) > 0.3
+    receipts = {ODOMETRY: TIME, COMMAND: TIME[some] + 0.001, REFERENCE: TIME}
+    run = run_of(speeds, speeds, receipts=receipts, timing=timing)
+    assert np.diff(TIME[some]).max() > STALL_PERIODS * 0.01
+    assert find_stalls(run) == []
+    kept = ~((TIME > 10.0) & (TIME < 10.3))
+    torn = replace(run, receipts=dict.fromkeys(receipts, TIME[kept]))
+    assert find_stalls(torn) == [pytest.approx((10.0, 10.3), abs=2e-3)]
+    assert find_stalls(replace(torn, lost=((10.01, 10.29),))) == []
+
+
 @pytest.mark.parametrize('wheel', ['right', 'left'])
 def test_a_blocked_wheel_is_named(wheel):
     wanted = wheels(np.random.default_rng(2))

@@ -263,6 +263,10 @@ STORIES = {
         rf"are not the controller's; {SETTLED}(, without the 1 s after them .*)?\.", 'open',
         rate=100.0, late=stalled((6.0, 0.066), (12.0, 0.074), (15.0, 0.066)),
     ),
+    'commands lost': Story(
+        rf'2\d\.\d % of cmd_vel is missing or not finite; {SETTLED}\.', 'open', rate=100.0,
+        kept=lambda t, topic: topic != '/cmd_vel' or round(997.0 * t) % 10 > 2,
+    ),
     'patrol': Story(
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
         r'\(RMS\); the rest were detours around obstacles and the ways back\.', 'good',

@@ -69,6 +69,8 @@ BLOCKED_TIME = 1.0
 """Least duration of a standstill of one wheel, s: longer than a slow drive crosses zero."""
 LASTING = 10.0
 """Time from which on a pose that moves otherwise than its twist is no event, s."""
+MOST_SENT = 0.8
+"""Share of the commands of a pause, and of three times as long after it, that a late loop has."""
 MIN_STALL = 0.02
 """Least length of a stall, s: receipts of fast robots jitter by as much."""
 
@@ -414,7 +416,8 @@ def find_stalls(run: Run) -> list[Span]:
     A pause is between two receipts of odometry without a command in between, between two commands
     of our controller although odometry comes, or from odometry to its command. Commands that
     go on are those of a machine that does, and so is the reference of a robot behind a radio:
-    there, a packet was lost.
+    there, a packet was lost. Commands that are missing, and do not come late, were lost; so were
+    messages that a recovery could not read.
     """
     odometry, timing = run.receipts.get(ODOMETRY), run.timing.get(ODOMETRY)
     if odometry is None or timing is None or not timing.period > 0.0 or run.other_clock:
@@ -424,7 +427,11 @@ def find_stalls(run: Run) -> list[Span]:
     commands = run.receipts.get(COMMAND) if run.ours else None
     if commands is not None and commands.size > 2:
         least = max(least, STALL_PERIODS * float(np.median(np.diff(commands))))
-        found += [span for span in _pauses(commands, least) if _received(odometry, *span)]
+        found += [
+            (low, high)
+            for low, high in _pauses(commands, least)
+            if _received(odometry, low, high) and _come_late(commands, odometry, low, high)
+        ]
     going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
     others = [run.receipts[name] for name in going_on if name in run.receipts]
     found = [span for span in found if not any(_received(each, *span) for each in others)]
@@ -434,7 +441,18 @@ def find_stalls(run: Run) -> list[Span]:
         late, asked = commands[prompt], odometry[index[prompt]]
         slow = (late - asked > least) & (late - asked < MIN_GAP)
         found += zip(asked[slow].tolist(), late[slow].tolist(), strict=True)
+    lost = [(low - least, high + least) for low, high in run.lost]
+    found = [
+        span for span in found if not any(low < span[1] and span[0] < high for low, high in lost)
+    ]
     return merged(found, -1e-6)
+
+
+def _come_late(commands: Array, odometry: Array, low: float, high: float) -> bool:
+    """Return whether the commands of a pause follow it: else they, and not the time, are lost."""
+    end = high + 3.0 * (high - low)
+    sent, due = (np.count_nonzero((low <= t) & (t < end)) for t in (commands, odometry))
+    return bool(sent > MOST_SENT * due)
 
 
 def _pauses(times: Array, least: float) -> list[Span]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.errors import DataError
+from t3mpc_ros.bag.message_losses import lost_spans
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history, link_metrics
@@ -182,6 +183,8 @@ class Run:
     """Sentences on where the data come from."""
     reports: Array = field(default_factory=lambda: np.empty(0))
     """Receive times of diagnostics."""
+    lost: tuple[tuple[float, float], ...] = ()
+    """Start and end of each part of the recording that a recovery could not read."""
     doubts: tuple[str, ...] = ()
     """Those of the oddities that concern the numbers of the messages."""
     damage: Mapping[str, str] = field(default_factory=dict)
@@ -221,9 +224,11 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     records = recording.metadata_records
     geometry = geometry_of(records, wanted, choice.ours, notes)
     columns = _columns(recording, topics.values())
-    raw, doubts, untrusted = {}, list[str](), []
+    raw, receipts, doubts, untrusted = {}, dict[str, Array](), list[str](), []
     for name, topic in topics.items():
-        raw[name], found = _read(recording, name, topic, columns.get(topic), oddities, doubts)
+        raw[name], receipts[name], found = _read(
+            recording, name, topic, columns.get(topic), oddities, doubts
+        )
         if found:
             damage |= found
             untrusted.append(name)
@@ -259,7 +264,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         channels=BY_BODY if geometry is None else BY_WHEEL,
         motions=motions,
         numbers=numbers,
-        receipts={name: table['received'] for name, table in raw.items()},
+        receipts={name: receipts[name] for name in raw},
         timing={
             name: _timing(table)
             for name, table in raw.items()
@@ -271,6 +276,10 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         changes=tuple(changes),
         links=tuple(links),
         reports=reports,
+        lost=tuple(
+            ((low - recording.start_ns) / NANOSECONDS, (high - recording.start_ns) / NANOSECONDS)
+            for low, high in lost_spans(records)
+        ),
         oddities=tuple(dict.fromkeys(oddities)),
         remarks=tuple(notes),
         doubts=tuple(doubts),
@@ -451,10 +460,10 @@ def _read(
     column: TopicColumns | None,
     notes: list[str],
     doubts: list[str],
-) -> tuple[dict[str, Array], dict[str, str]]:
+) -> tuple[dict[str, Array], Array, dict[str, str]]:
     """Return the arrays of one topic, and why nothing of it is valid, if so, with the remedy.
 
-    Rows that are not finite are left out.
+    Rows that are not finite are left out, but for the receive times between both.
     """
     kind = recording.topics[topic].type_name
     if kind.endswith(('/Twist', '/TwistStamped')):
@@ -471,6 +480,7 @@ def _read(
         instants = {'received': column.received_ns, 'stamp': stamps}
         table = {key: (each - recording.start_ns) / NANOSECONDS for key, each in instants.items()}
         table |= dict(zip(fields, column.numbers.T, strict=True))
+    received = table['received']
     sound = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if not sound.all():
         text = f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not finite'
@@ -506,7 +516,7 @@ def _read(
                     'measured from it is valid'
                 )
                 damage[text] = 'Correct the units in its driver, or see why wheels spin.'
-    return table, damage
+    return table, received, damage
 
 
 def _yaw(table: Mapping[str, Array]) -> Array:

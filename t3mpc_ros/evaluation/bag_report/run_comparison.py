@@ -239,7 +239,7 @@ def _load(number: int, folder: Path, path: Path, wanted: ReportOptions | None) -
     parameters = {
         f'{node} {name}': value
         for node, table in records.items()
-        if node not in ('losses', 'provenance')
+        if node.split(' ')[0] not in ('losses', 'provenance')
         for name, value in table.items()
     }
     label = f'{chr(ord("A") + number)}, {bag_display_name(folder)}'

@@ -146,7 +146,13 @@ def judge(
     if missing > MAX_MISSING:
         text = f'{100.0 * missing:.1f} % of {ODOMETRY} is missing'
         loss.append(_Finding(text, 'Data missing', spoils=True))
-    findings += [*_jumps(incidents), *slow, *loss]
+    elif (share := _missing_commands(run)) > MAX_MISSING:
+        loss.append(
+            _Finding(
+                f'{100.0 * share:.1f} % of {COMMAND} is missing or not finite', 'Data missing'
+            )
+        )
+    findings += [*_jumps(incidents), *_lost_parts(run), *slow, *loss]
     late = _late(run, latency_99)
     distance, on_path = path_distance(run), None
     if run.follows_path:
@@ -361,6 +367,23 @@ def _late(run: Run, latency_99: float) -> str:
         f'The machine was slow: 99 % of the commands came within {1e3 * latency_99:.1f} ms of '
         f'their odometry, whose period is {1e3 * timing.period:.1f} ms.'
     )
+
+
+def _missing_commands(run: Run) -> float:
+    """Return the missing share of the commands of our controller, one to each odometry."""
+    command, odometry = run.timing.get(COMMAND), run.timing.get(ODOMETRY)
+    if not run.ours or command is None or odometry is None or run.other_clock:
+        return 0.0
+    same = abs(command.period - odometry.period) < 0.2 * odometry.period
+    return command.missing - odometry.missing if same else 0.0
+
+
+def _lost_parts(run: Run) -> Iterator[_Finding]:
+    if run.lost:
+        size = sum(high - low for low, high in run.lost)
+        parts = f'{len(run.lost)} damaged parts of {duration_text(size)} in all'
+        parts = parts if len(run.lost) > 1 else f'a damaged part of {duration_text(size)}'
+        yield _Finding(f'the messages of {parts} are lost in the recovered bag', 'Data missing')
 
 
 def _jumps(incidents: Incidents) -> Iterator[_Finding]:
