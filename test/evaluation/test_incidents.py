@@ -274,6 +274,36 @@ def test_noise_outliers_strafing_and_the_localizer_carry_nothing():
     assert not find_carried(replace(run, motions=corrected, parameters={'localizer': {}}))
 
 
+@pytest.mark.parametrize('twist', [0.0, 1.0])
+def test_odometry_that_stays_the_same_in_a_drive_is_frozen(twist):
+    speeds = wheels(np.random.default_rng(6))
+    run = run_of(speeds, speeds)
+    drive = run.motions[ODOMETRY]
+    row = np.where(TIME < 20.0, np.arange(TIME.size), 2000)
+    values = {key: each[row] for key, each in drive.values.items()}
+    still = {key: np.where(TIME < 20.0, values[key], twist * values[key])
+             for key in ('linear', 'angular')}  # fmt: skip
+    frozen = moved(drive, **(values | still))
+    found = find_incidents(replace(run, motions={**run.motions, ODOMETRY: frozen, TRUTH: drive}))
+    ((start, end, text),) = found.frozen
+    assert (start, end) == pytest.approx((20.0, TIME[-1]), abs=0.02)
+    assert ('its twist amounts to' if twist else 'ground_truth/odom moves by') in text
+    assert found.carried == ()
+    # A robot that stands does not, and neither does one seen by a camera with noise of 3 mm.
+    seen = np.random.default_rng(1).normal(0.0, 0.003, TIME.size)
+    rest = moved(drive, **{key: np.zeros(TIME.size) for key in drive.values})
+    both = {ODOMETRY: rest, TRUTH: moved(rest, x=seen, yaw=3.0 * seen)}
+    assert find_incidents(replace(run, motions=both)).frozen == ()
+    # Nor does odometry without a pose at a constant speed.
+    constant = {key: np.full(TIME.size, 0.2 * (key in still)) for key in drive.values}
+    both = {ODOMETRY: moved(drive, **constant)}
+    assert find_incidents(replace(run, motions=both)).frozen == ()
+    # Nor does a slow stream that is repeated.
+    again = np.arange(TIME.size) // 40 * 40
+    held = moved(drive, **{key: each[again] for key, each in drive.values.items()})
+    assert find_incidents(replace(run, motions={**run.motions, ODOMETRY: held})).frozen == ()
+
+
 def test_a_twist_of_the_opposite_sign_is_no_event():
     speeds = wheels(np.random.default_rng(8))
     run = run_of(speeds, speeds)

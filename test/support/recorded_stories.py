@@ -84,6 +84,8 @@ class Story:
     """Other names of topics."""
     second_robot: bool = False
     second_controller: bool = False
+    frozen: float = math.inf
+    """Time from which the odometry repeats its last message with a new stamp, s."""
     switches: tuple = ()
     """Times at which the reference switches, s."""
     rate: float = 50.0
@@ -111,7 +113,9 @@ class Story:
             target = _seen_from(origin, place) if self.path else (0.0, 0.0, 0.0)
             ahead = serialised_odometry(stamp, wanted, target)
             motion = serialised_odometry(measured, speed, shown)
-            odometry = serialised_odometry(measured, speed, _seen_from(origin, shown))
+            if t < self.frozen:
+                last = speed, _seen_from(origin, shown)
+            odometry = serialised_odometry(measured, *last)
             rows += [
                 (max(received - LEAD, 0.0), '/reference', ahead),
                 (received + 2e-4, '/odom', odometry),
@@ -314,6 +318,15 @@ STORIES = {
         rf'The position of (odom|ground_truth/odom) jumps by 3\.00\d m at 8\.0 s, the largest of '
         rf'2 jumps; {SETTLED}\.', 'open', moved=lambda t: 3.0 * (t >= 8.0),
         reports=((5.0, 'sim_robot', WARNING, SKIPPED),),
+    ),
+    'odometry frozen': Story(
+        r'Odom stays the same from 12\.0 s on for 8\.0 s, although its twist amounts to 1\.\d+ '
+        rf'm; {SETTLED}\.', 'bad', frozen=12.0,
+    ),
+    'odometry frozen without a reference': Story(
+        r'Odom stays the same from 12\.0 s on for 8\.0 s, although its twist amounts to 1\.\d+ m; '
+        r'the robot drove 2\.[12]\d m in 20\.0 s; the bag holds no reference, so tracking cannot '
+        r'be judged\.', 'bad', frozen=12.0, names={'/reference': '', '/ground_truth/odom': ''},
     ),
     'carried': Story(
         r'The pose of (odom|ground_truth/odom) moves by 1(\.\d+)? m at 8\.\d s, which its twist '

@@ -28,6 +28,8 @@ from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
     cause_between,
 )
 from t3mpc_ros.evaluation.bag_report.motion_continuity import (
+    DISPLACED,
+    DISPLACED_TURN,
     DISPLACED_WINDOW,
     MIN_GAP,
     Displacement,
@@ -67,6 +69,8 @@ WHEEL_STILL, WHEEL_DEMANDED = 0.2, 0.8
 """Smoothed speed of a wheel that stands, and least command to one that is to turn, rad/s."""
 BLOCKED_TIME = 1.0
 """Least duration of a standstill of one wheel, s: longer than a slow drive crosses zero."""
+FROZEN_TIME = 1.0
+"""Least time in which no number of an odometry changes although its robot moves, s."""
 LASTING = 10.0
 """Time from which on a pose that moves otherwise than its twist is no event, s."""
 MOST_SENT = 0.8
@@ -136,6 +140,9 @@ class Incidents:
     blocked: tuple[tuple[float, float, str], ...] = ()
     """Start and end of each time in which one wheel stood although it was commanded to turn, while
     the other one turned, and which."""
+    frozen: tuple[tuple[float, float, str], ...] = ()
+    """Start and end of each time in which an odometry stayed the same although it should not, and
+    what happened."""
     jumps: tuple[Jump, ...] = ()
     carried: tuple[Carried, ...] = ()
     slips: tuple[Span, ...] = ()
@@ -167,6 +174,7 @@ class Incidents:
             (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
             for jump in self.jumps
         ]
+        found += [(start, 'gap', text) for start, _, text in self.frozen]
         found += [(each.time, 'jump', each.text) for each in self.carried]
         slips = 'a wheel slips, is blocked, or has lost steps'
         found += [(start, 'slip', f'for {end - start:.1f} s {slips}') for start, end in self.slips]
@@ -188,6 +196,7 @@ def find_incidents(run: Run) -> Incidents:
             )
         ),
         find_blocked_wheels(run),
+        find_frozen(run),
         find_jumps(run),
         find_carried(run),
         find_slips(run),
@@ -483,6 +492,39 @@ def find_jumps(run: Run) -> tuple[Jump, ...]:
     return tuple(sorted(found))
 
 
+def find_frozen(run: Run) -> tuple[tuple[float, float, str], ...]:
+    """Return when an odometry stayed the same although its twist, or ground truth, moved on."""
+    found = []
+    truth = run.motions.get(TRUTH)
+    for name in (ODOMETRY, TRUTH):
+        motion = run.motions.get(name)
+        if motion is None or 'x' not in motion.values or name in run.untrusted:
+            continue
+        keys = ('x', 'y', 'yaw', *STILL)
+        same = np.all([np.diff(motion[key]) == 0.0 for key in keys], axis=0)
+        for rows in spans_of(same):
+            start, end = float(motion.time[rows.start]), float(motion.time[rows.stop])
+            if end - start < FROZEN_TIME:
+                continue
+            has_pose = any(np.ptp(motion[key]) for key in ('x', 'y', 'yaw'))
+            span = end - start if has_pose else 0.0
+            apart = [span * abs(float(motion[key][rows.start])) for key in STILL]
+            against = 'its twist amounts to'
+            if not _is_far(*apart) and name == ODOMETRY and truth is not None:
+                x, y, yaw = np.abs(_poses(truth, motion.time[rows]) - _poses(truth, start)).T
+                apart, against = [np.hypot(x, y).max(), yaw.max()], f'{TRUTH} moves by'
+            if _is_far(*apart):
+                far, turned = apart
+                way = f'{far:.3g} m' if far > DISPLACED else f'{turned:.3g} rad'
+                text = f'{name} stays the same from {start:.1f} s on for {end - start:.1f} s'
+                found.append((start, end, f'{text}, although {against} {way}'))
+    return tuple(sorted(found))
+
+
+def _is_far(distance: float, turn: float) -> bool:
+    return distance > DISPLACED or turn > DISPLACED_TURN
+
+
 def find_carried(run: Run) -> tuple[Carried, ...]:
     """Return where a pose moves otherwise than its twist says, or ground truth than odometry.
 
@@ -509,16 +551,19 @@ def find_carried(run: Run) -> tuple[Carried, ...]:
         time, moves = odometry.time, _moves_by_pose(odometry)
         pairs.append((TRUTH, ODOMETRY, time, _poses(truth, time), moves))
     times, found = [jump.time for jump in find_jumps(run)], []
+    frozen = find_frozen(run)
     for name, against, time, poses, moves in pairs:
         for each in displacements(time, poses, moves):
             low, high = each.start - DISPLACED_WINDOW, each.start + each.duration
-            if not any(low <= when <= high for when in times):  # one event is reported once
+            still = any(start <= each.start and low <= end for start, end, _ in frozen)
+            # One event is reported once.
+            if not still and not any(low <= when <= high for when in times):
                 times.append(each.start)
                 found.append(Carried(each.start, name, against, each))
     return tuple(sorted(found))
 
 
-def _poses(motion: Series, time: Array) -> Array:
+def _poses(motion: Series, time: Array | float) -> Array:
     """Return x, y (m) and yaw (rad) at some times, shape (n, 3)."""
     axes = motion['x'], motion['y'], np.unwrap(motion['yaw'])
     return np.column_stack([np.interp(time, motion.time, each) for each in axes])

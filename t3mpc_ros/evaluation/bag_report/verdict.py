@@ -15,8 +15,8 @@
 
 One sentence, the same in the terminal, on the page and in the report. What happened comes first,
 in this order: a recording that cannot be trusted, several publishers of a topic, nothing to judge,
-a stop, a blocked wheel, a gap, a condition of the robot, a jump, a machine too slow, an error that
-is too large.
+a stop, a blocked wheel, a gap, frozen odometry, a condition of the robot, a jump, a machine too
+slow, an error that is too large.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
     Cause,
     cause_of,
 )
-from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving, find_frozen
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     format_pair,
@@ -247,6 +247,8 @@ def _without(run: Run, lacking: Sequence[str]) -> str:
         return text
     steps = np.diff(motion.time)
     steps = np.where(steps < 1.0, steps, 0.0)  # not over gaps
+    for start, end, _ in find_frozen(run):  # it did not move so far
+        steps = np.where((start < motion.time[1:]) & (motion.time[1:] <= end), 0.0, steps)
     way = float(np.sum(np.abs(motion['linear'][1:]) * steps))
     span = float(motion.time[-1] - motion.time[0])
     return f'the robot drove {format_number(way)} m in {duration_text(span)}; {text}'
@@ -267,7 +269,7 @@ def _never_driven(run: Run) -> _Finding:
 
 
 def _interruptions(run: Run, incidents: Incidents) -> Iterator[_Finding]:
-    """Yield stops, blocked wheels, gaps, and conditions of the robot."""
+    """Yield stops, blocked wheels, gaps, frozen odometry, and conditions of the robot."""
     if incidents.stops:
         yield _stop_finding(run, incidents)
     for start, end, title in incidents.blocked:
@@ -284,6 +286,10 @@ def _interruptions(run: Run, incidents: Incidents) -> Iterator[_Finding]:
         if (count := len({(low, high) for low, high, _ in incidents.gaps})) > 1:
             text += f', the longest of {count} gaps'
         yield _Finding(text, f'Data missing from {start:.1f} s on', spoils=True)
+    if incidents.frozen:
+        start, _, text = max(incidents.frozen, key=lambda each: each[1] - each[0])
+        remedy = 'See the driver of the robot: it repeats its last message.'
+        yield _Finding(text, f'Odometry frozen at {start:.1f} s', remedy, spoils=True)
     seen = set()
     for event in run.complaints:
         cause = cause_of(event, stops=False)
