@@ -314,6 +314,14 @@ STORIES = {
         rf'{SETTLED}\.', 'bad',
         kept=lambda t, topic: topic == '/reference' or not 10.0 < t < 14.0,
     ),
+    'odometry ends': Story(
+        rf'Odom ends at 12\.0 s, 8\.0 s before the commands do; {SETTLED}\.', 'bad',
+        kept=lambda t, topic: topic != '/odom' or t <= 12.0,
+    ),
+    'reference ends': Story(
+        rf'Reference ends at 14\.6 s, 5\.4 s before the commands do; {SETTLED}\.', 'open',
+        kept=lambda t, topic: topic != '/reference' or t <= 14.6,
+    ),
     'jump': Story(
         rf'The position of (odom|ground_truth/odom) jumps by 3\.00\d m at 8\.0 s, the largest of '
         rf'2 jumps; {SETTLED}\.', 'open', moved=lambda t: 3.0 * (t >= 8.0),

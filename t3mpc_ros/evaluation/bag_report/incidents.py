@@ -31,6 +31,7 @@ from t3mpc_ros.evaluation.bag_report.motion_continuity import (
     DISPLACED,
     DISPLACED_TURN,
     DISPLACED_WINDOW,
+    GAP_PERIODS,
     MIN_GAP,
     Displacement,
     displacements,
@@ -137,6 +138,8 @@ class Incidents:
     """Pauses of the loop."""
     gaps: tuple[tuple[float, float, str], ...] = ()
     """Start, end, and relative name of the topic."""
+    ended: tuple[tuple[float, float, str], ...] = ()
+    """Likewise, of each odometry and reference that ends before the drive does."""
     blocked: tuple[tuple[float, float, str], ...] = ()
     """Start and end of each time in which one wheel stood although it was commanded to turn, while
     the other one turned, and which."""
@@ -164,7 +167,8 @@ class Incidents:
             for start, end in self.stalls
         ]
         found += [
-            (start, 'gap', f'no {name} for {end - start:.1f} s') for start, end, name in self.gaps
+            (start, 'gap', f'no {name} for {end - start:.1f} s')
+            for start, end, name in (*self.gaps, *self.ended)
         ]
         found += [
             (start, 'stop', f'of the {title}, for {end - start:.2f} s, although commanded to turn')
@@ -195,6 +199,7 @@ def find_incidents(run: Run) -> Incidents:
                 for low, high in gaps(run.motions[name].time)
             )
         ),
+        find_ends(run),
         find_blocked_wheels(run),
         find_frozen(run),
         find_jumps(run),
@@ -215,6 +220,20 @@ def driving(run: Run) -> Span:
         return -math.inf, math.inf
     moving = command.time[moves(command)]
     return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
+
+
+def find_ends(run: Run) -> tuple[tuple[float, float, str], ...]:
+    """Return the odometry and the reference that end before the drive does; see Incidents."""
+    _, last = driving(run)
+    found = []
+    for name in (ODOMETRY, REFERENCE):
+        motion = run.motions.get(name)
+        if motion is not None and len(motion) > 1 and name in run.receipts:
+            end = float((motion.time if run.other_clock else run.receipts[name])[-1])
+            least = MIN_GAP + GAP_PERIODS * float(np.median(np.diff(motion.time)))
+            if least < last - end < math.inf:
+                found.append((end, last, name))
+    return tuple(sorted(found))
 
 
 def smooth(series: Series, name: str) -> tuple[Array, Array]:

@@ -66,6 +66,8 @@ obstacles, looking around and the way back are no errors; the path itself goes o
 MOSTLY = 0.5
 """Share of the drive on the path below which the verdict says so."""
 
+ENDED = {ODOMETRY: 'the robot', REFERENCE: 'the reference generator'}
+"""What publishes a topic."""
 SINGLE_PUBLISHER = 'Stop all publishers but one, or give each robot a namespace.'
 
 
@@ -286,6 +288,12 @@ def _interruptions(run: Run, incidents: Incidents) -> Iterator[_Finding]:
         if (count := len({(low, high) for low, high, _ in incidents.gaps})) > 1:
             text += f', the longest of {count} gaps'
         yield _Finding(text, f'Data missing from {start:.1f} s on', spoils=True)
+    for start, end, name in incidents.ended:
+        text = f'{name} ends at {start:.1f} s, {duration_text(end - start)} before the commands do'
+        remedy = f'See why {ENDED[name]} fell silent, or the recorder no longer received it.'
+        # A robot may be driven on by hand where its reference ends.
+        spoils = name == ODOMETRY
+        yield _Finding(text, f'No {name} from {start:.1f} s on', remedy, spoils)
     if incidents.frozen:
         start, _, text = max(incidents.frozen, key=lambda each: each[1] - each[0])
         remedy = 'See the driver of the robot: it repeats its last message.'
