@@ -96,6 +96,7 @@ def set_speed(value):
 
 
 def stand(i, t, message):
+    message.pose = only('/odom')[0][2].pose
     message.twist.twist.linear.x = message.twist.twist.angular.z = 0.0
 
 

@@ -84,6 +84,8 @@ class Story:
     """Other names of topics."""
     second_robot: bool = False
     second_controller: bool = False
+    twist: bool = True
+    """Whether the odometry has one."""
     frozen: float = math.inf
     """Time from which the odometry repeats its last message with a new stamp, s."""
     switches: tuple = ()
@@ -114,7 +116,7 @@ class Story:
             ahead = serialised_odometry(stamp, wanted, target)
             motion = serialised_odometry(measured, speed, shown)
             if t < self.frozen:
-                last = speed, _seen_from(origin, shown)
+                last = speed if self.twist else (0.0, 0.0), _seen_from(origin, shown)
             odometry = serialised_odometry(measured, *last)
             rows += [
                 (max(received - LEAD, 0.0), '/reference', ahead),
@@ -313,6 +315,14 @@ STORIES = {
         rf'No (odom|ground_truth/odom) for 4\.0 s from 10\.0 s on, the longest of \d gaps; '
         rf'{SETTLED}\.', 'bad',
         kept=lambda t, topic: topic == '/reference' or not 10.0 < t < 14.0,
+    ),
+    'no twist': Story(
+        r'Good run: settled RMSE 0\.0[0-4]\d+ / 0\.0[0-4]\d+ rad/s, and the robot never stood\.',
+        'good', twist=False, names={'/ground_truth/odom': ''},
+    ),
+    'no twist, ten times a second': Story(
+        r'The robot drove 3\.[56]\d m in 19\.9 s; the bag holds no reference, so tracking cannot '
+        r'be judged\.', 'open', records={}, names=OTHER_ROBOT, twist=False, rate=10.0,
     ),
     'odometry ends': Story(
         rf'Odom ends at 12\.0 s, 8\.0 s before the commands do; {SETTLED}\.', 'bad',

@@ -29,6 +29,8 @@ from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history, link_metrics
 from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.bag_report.motion_continuity import (
+    DISPLACED,
+    DISPLACED_TURN,
     MIN_JUMPS,
     MIXED_SHARE,
     MIXED_STEP,
@@ -75,6 +77,8 @@ SWITCH_WINDOW = 0.25
 """Largest time from a change of the signals to the step of the reference, s."""
 JUMP = 10.0
 """Jump (s) of the stamps against the receive times that indicates a changed clock."""
+POSE_WINDOW = 0.2
+"""Least time over which the pose of an odometry without a twist is differentiated, s."""
 MOST = 0.98
 """Share of finite messages above which a verdict does not mention the others."""
 
@@ -249,7 +253,12 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
             motions[name] = _motion(clock.local(table['received']), table, geometry)
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
-    oddities += _oddities_of_motions(topics, raw)
+        if name in (ODOMETRY, TRUTH) and _lacks_twist(motions[name]):
+            motions[name] = _differentiated(motions[name], geometry)
+            text = f'The twist of {topics[name]} is zero while its pose moves'
+            doubts.append(f'{text}: its speeds are those of the pose.')
+            oddities.append(doubts[-1])
+    oddities += _oddities_of_motions(topics, raw, motions)
     complaints, changes, links, reports = diagnostic_history.read_diagnostics(
         recording, choice.namespaces[0]
     )
@@ -362,7 +371,9 @@ def _publishers(
 
 
 def _oddities_of_motions(
-    topics: Mapping[str, str], raw: Mapping[str, Mapping[str, Array]]
+    topics: Mapping[str, str],
+    raw: Mapping[str, Mapping[str, Array]],
+    motions: Mapping[str, Series],
 ) -> list[str]:
     """Return sentences on motions that are constant, or of one message."""
     found = []
@@ -372,7 +383,7 @@ def _oddities_of_motions(
         count = table['stamp'].size
         if count == 1:
             found.append(f'{topics[name]} has a single message: nothing follows from it.')
-        elif not any(table[key].any() for key in ('linear', 'angular')):
+        elif not moves(motions[name]).any():
             found.append(
                 f'Every speed of {topics[name]} is zero in all {count} messages: the robot stood, '
                 'or it is not connected.'
@@ -550,17 +561,41 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | N
     """Return a motion sorted by time; of two samples at one instant the last one."""
     time, back = np.unique(time[::-1], return_index=True)
     order = table['linear'].size - 1 - back
-    linear: Any = table['linear'][order]
-    angular: Any = table['angular'][order]
-    values = {'linear': linear, 'angular': angular}
-    if geometry is not None:
-        wheels: Any = wheels_from_twist(BodyTwist(linear, angular), geometry)
-        values |= {'right': wheels.right, 'left': wheels.left}
+    values = _speeds(table['linear'][order], table['angular'][order], geometry)
     if 'x' in table:
         yaw = _yaw(table)
         values |= {name: table[name][order] for name in ('x', 'y', 'lateral')}
         values['yaw'] = yaw[order]
     return Series(time, values)
+
+
+def _speeds(linear: Any, angular: Any, geometry: WheelGeometry | None) -> dict[str, Array]:
+    """Return speeds (m/s, rad/s) with those of the wheels where these are known."""
+    values = {'linear': linear, 'angular': angular}
+    if geometry is not None:
+        wheels: Any = wheels_from_twist(BodyTwist(linear, angular), geometry)
+        values |= {'right': wheels.right, 'left': wheels.left}
+    return values
+
+
+def _lacks_twist(motion: Series) -> bool:
+    """Return whether every twist is zero although the pose is elsewhere later."""
+    axes = ((motion['x'], DISPLACED), (motion['y'], DISPLACED), (motion['yaw'], DISPLACED_TURN))
+    far = (np.ptp(np.unwrap(each)) > most for each, most in axes)
+    return not moves(motion).any() and any(far)
+
+
+def _differentiated(motion: Series, geometry: WheelGeometry | None) -> Series:
+    """Return a motion whose speeds are the change of its pose within :data:`POSE_WINDOW`."""
+    time, yaw = motion.time, np.unwrap(motion['yaw'])
+    half = max(0.5 * POSE_WINDOW, 1.5 * float(np.median(np.diff(time))))
+    first = np.searchsorted(time, time - half)
+    last = np.searchsorted(time, time + half, 'right') - 1
+    elapsed = np.maximum(time[last] - time[first], 1e-9)  # one alone does not move
+    x, y, turn = (each[last] - each[first] for each in (motion['x'], motion['y'], yaw))
+    middle = 0.5 * (yaw[first] + yaw[last])
+    linear = (np.cos(middle) * x + np.sin(middle) * y) / elapsed
+    return Series(time, {**motion.values, **_speeds(linear, turn / elapsed, geometry)})
 
 
 def _timing(table: Mapping[str, Array]) -> Timing:
