@@ -432,6 +432,18 @@ def test_runs_of_one_reference_may_begin_at_different_places(tmp_path, capsys):
         assert 'er settled error: right wheel: ' in capsys.readouterr().out
 
 
+def test_errors_by_ground_truth_and_by_odometry_do_not_compare(tmp_path, capsys):
+    drive = following_rows()
+    exact = [(t, '/ground_truth/odom', m) for t, topic, m in drive if topic == '/odom']
+    made = {'simulated': sorted([*drive, *exact], key=lambda row: row[0]), 'real': drive}
+    folders = [str(write(tmp_path / name, each)) for name, each in made.items()]
+    assert bag_main(['report', *folders, '--output', str(tmp_path / 'out')]) == 0
+    assert (
+        'Not comparable: The errors of A, simulated are measured by ground_truth/odom, those of '
+        'B, real by odom.'
+    ) in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_runs_that_cannot_be_compared_get_no_verdict(rows, tmp_path, capsys):
     drive = following_rows()

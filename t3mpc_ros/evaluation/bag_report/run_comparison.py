@@ -188,6 +188,11 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
         return 'the wheels of one robot are unknown'
     if first.run.follows_path != other.run.follows_path:
         return 'the one follows a path, the other one speeds'
+    if first.run.measured != other.run.measured:
+        return (
+            f'the errors of {first.label} are measured by {first.run.measured}, those of '
+            f'{other.label} by {other.run.measured}'
+        )
     share, text = reference_difference(first, other)
     if share > SAME_REFERENCE:
         return f'the references differ, so the runs had different tasks ({text})'
