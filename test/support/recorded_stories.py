@@ -324,6 +324,17 @@ STORIES = {
         r'The robot drove 3\.[56]\d m in 19\.9 s; the bag holds no reference, so tracking cannot '
         r'be judged\.', 'open', records={}, names=OTHER_ROBOT, twist=False, rate=10.0,
     ),
+    'clock behind': Story(
+        r'The stamps of odom are 1\.0 s behind those of reference: they are of different clocks, '
+        r'so tracking cannot be judged\.', 'bad', apart=-1_000_000_000,
+    ),
+    'clock ahead': Story(
+        r'The stamps of odom are 5\.0 s ahead of those of reference: they are of different '
+        r'clocks, so tracking cannot be judged\.', 'bad', apart=5_000_000_000,
+    ),
+    'slow transport': Story(
+        rf'Good run: {SETTLED}, and the robot never stood\.', 'good', late=lambda t: 0.3,
+    ),
     'odometry ends': Story(
         rf'Odom ends at 12\.0 s, 8\.0 s before the commands do; {SETTLED}\.', 'bad',
         kept=lambda t, topic: topic != '/odom' or t <= 12.0,

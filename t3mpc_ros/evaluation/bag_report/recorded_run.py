@@ -77,6 +77,11 @@ SWITCH_WINDOW = 0.25
 """Largest time from a change of the signals to the step of the reference, s."""
 JUMP = 10.0
 """Jump (s) of the stamps against the receive times that indicates a changed clock."""
+MIN_APART, MIN_OVERLAP = 0.1, 5.0
+"""Least difference of two clocks that counts, and least time in which motions are compared, s."""
+CORRECTED = 0.5
+"""Distance of the odometry from its reference with corrected stamps, as a share of that with its
+own, below which these are of another clock. With stamps 1 s off it is 0.08, 0.2 s off 0.31."""
 POSE_WINDOW = 0.2
 """Least time over which the pose of an odometry without a twist is differentiated, s."""
 MOST = 0.98
@@ -200,6 +205,9 @@ class Run:
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
     map_changes: tuple[RecordedChange, ...] = ()
+    behind: float = 0.0
+    """By how much the stamps of the odometry are behind those of the reference, if both are of
+    different clocks, s; else 0."""
     publishers: Mapping[str, bool] = field(default_factory=dict)
     """Sentences on motions with several publishers, and whether several are seen to publish."""
     other_clock: bool = False
@@ -296,6 +304,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         untrusted=tuple(untrusted),
         world=records.get('sim_robot', {}).get('world', ''),
         map_changes=read_map_changes(recording, choice.namespaces[0], clock.local),
+        behind=_behind(raw, motions),
         publishers=_publishers(recording, topics, motions, complaints),
         other_clock=clock.other,
         parameters=records,
@@ -448,6 +457,35 @@ class _Clock:
     def local(self, received: Array) -> Array:
         """Return the stamp time of a receive time."""
         return received + np.interp(received, self._received, self._offset) - self.origin
+
+
+def _behind(raw: Mapping[str, Mapping[str, Array]], motions: Mapping[str, Series]) -> float:
+    """Return how far stamps of odometry are behind the reference; see :attr:`Run.behind`.
+
+    They are as far before their receipt, which a slow transport is as well; but then the robot
+    follows at the time of the stamps, and not far better by so much later.
+    """
+    odometry, reference = motions.get(ODOMETRY), motions.get(REFERENCE)
+    if odometry is None or reference is None:
+        return 0.0
+    apart = float(np.median(raw[ODOMETRY]['received'] - raw[ODOMETRY]['stamp']))
+    if abs(apart) < MIN_APART:
+        return 0.0
+    stamped, corrected = (_distance(odometry, reference, by) for by in (0.0, apart))
+    return apart if corrected < CORRECTED * stamped else 0.0
+
+
+def _distance(odometry: Series, reference: Series, by: float) -> float:
+    """Return the RMS distance of two motions, the first one later by ``by`` s, as a share."""
+    part = odometry.between(float(reference.time[0]) - by, float(reference.time[-1]) - by)
+    if not len(part) or part.time[-1] - part.time[0] < MIN_OVERLAP:
+        return math.inf
+    squares = 0.0
+    for name in ('linear', 'angular'):
+        wanted = np.interp(part.time + by, reference.time, reference[name])
+        size = float(np.mean(wanted**2))
+        squares += float(np.mean((part[name] - wanted) ** 2)) / size if size else 0.0
+    return math.sqrt(squares)
 
 
 def _columns(recording: BagReader, topics: Iterable[str]) -> Mapping[str, TopicColumns]:

@@ -14,9 +14,9 @@
 """The verdict on a recorded run: what happened in it, and whether its numbers measure something.
 
 One sentence, the same in the terminal, on the page and in the report. What happened comes first,
-in this order: a recording that cannot be trusted, several publishers of a topic, nothing to judge,
-a stop, a blocked wheel, a gap, frozen odometry, a condition of the robot, a jump, a machine too
-slow, an error that is too large.
+in this order: a recording that cannot be trusted, several publishers of a topic, different clocks,
+nothing to judge, a stop, a blocked wheel, a gap, frozen odometry, a condition of the robot, a
+jump, a machine too slow, an error that is too large.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -130,6 +130,16 @@ def judge(
     if several := run.publishers:
         text, spoils = ', '.join(several), any(several.values())
         findings.append(_Finding(text, 'Several publishers', SINGLE_PUBLISHER, spoils))
+    if run.behind:
+        where = 'behind' if run.behind > 0.0 else 'ahead of'
+        said = _Finding(
+            f'the stamps of {ODOMETRY} are {duration_text(abs(run.behind))} {where} those of '
+            f'{REFERENCE}: they are of different clocks, so tracking cannot be judged',
+            'Stamps of different clocks',
+            f'Set the clocks of the computers, or stamp {ODOMETRY} by that of the controller.',
+            spoils=True,
+        )
+        return _verdict(run, [*findings, said], '', judged=False, damaged=damaged)
     lacking = _lacking(run)
     if run.measured in run.untrusted:
         return _verdict(run, findings, '', judged=not lacking, damaged=True)
