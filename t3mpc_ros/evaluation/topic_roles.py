@@ -113,6 +113,10 @@ def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
         if others or (name in chosen and not by_name):
             rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
             notes.append(f'{what} is taken from {chosen[name]}{rest}.')
+    for name, full in chosen.items():
+        others = [other for other, topic in chosen.items() if topic == full and other != name]
+        if others:
+            raise ReportError(f'{full} is given as {name} and as {others[0]}: choose another one')
     if not chosen:
         raise ReportError(
             f'{recording.folder}: there is nothing to report: no message of odometry '

@@ -225,6 +225,24 @@ def test_a_reference_may_be_named(rows, tmp_path, capsys):
     )
 
 
+def test_a_run_whose_reference_is_named_is_judged(tmp_path, capsys):
+    names = {'/reference': '/wanted', '/odom': '/base/odometry', '/cmd_vel': '/mux/out'}
+    drive = following_rows()
+    folder = write(tmp_path / 'usual', drive)
+    usual, _ = text_of(folder, capsys)
+    renamed = write(tmp_path / 'renamed', [(t, names[topic], m) for t, topic, m in drive])
+    said, _ = text_of(renamed, capsys, '--reference', '/wanted', '--wheel-radius', '0.035',
+                      '--track', '0.147')  # fmt: skip
+    assert said.splitlines()[0] == usual.splitlines()[0]
+    assert said.startswith('Good run')
+    assert 'switches' not in said, 'they are not known without the signals'
+    for option in (['--reference', '/odom'], ['--odom', '/reference']):
+        assert bag_main(['report', str(folder), *option]) == 1
+        assert 'as odom and as reference' in capsys.readouterr().err.replace(
+            'as reference and as odom', 'as odom and as reference'
+        )
+
+
 # -- what cannot be reported --------------------------------------------------------------------
 
 

@@ -396,7 +396,7 @@ def test_the_verdict_names_an_impossible_odometry(name, tmp_path, capsys):
         assert 'drove' not in verdict['text']
         # Tables had its errors, its path and its delay as if they were those of a robot.
         assert {name.split(' (')[0] for name, number in numbers.items() if number is not None} == {
-            'duration', 'messages', 'switches', *(f'variation of the command per second, {each}'
+            'duration', 'messages', *(f'variation of the command per second, {each}'
                                                  for each in ('linear', 'angular')),
         }  # fmt: skip
         assert 'Path and stops' not in page

@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
 from t3mpc_ros.evaluation.bag_report.link_metrics import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
-from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
+from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
@@ -235,7 +235,12 @@ CHANNEL_NUMBERS: tuple[ChannelNumber, ...] = (
 RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
     ('duration', 's', lambda found: found.run.duration),
     ('messages', '', lambda found: found.messages),
-    ('switches', '', lambda found: found.run.switches.size),
+    (
+        'switches', '',
+        lambda found: (
+            found.run.switches.size if {*SIGNAL_NAMES} & {*found.run.numbers} else math.nan
+        ),
+    ),
     (
         'stood although it was to move', 's',
         lambda found: math.nan if found.run.motion is None else found.incidents.stopped,

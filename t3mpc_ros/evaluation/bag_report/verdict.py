@@ -87,7 +87,7 @@ class Verdict:
     sound: bool = True
     """Whether nothing speaks against the numbers."""
     judged: bool = True
-    """Whether the bag holds a closed loop of this package, which can be judged."""
+    """Whether the bag holds a closed loop, which can be judged."""
     slow: bool = False
     """Whether the machine was too slow, which explains what is wrong if anything is."""
     damaged: bool = False
@@ -242,12 +242,10 @@ def duration_text(seconds: float) -> str:
 
 
 def _lacking(run: Run) -> tuple[str, ...]:
-    """Return what a closed loop of this package has, and the run has not."""
+    """Return what a closed loop has, and the run has not."""
     lacking = [name for name in (REFERENCE, COMMAND) if name not in run.motions]
     if not run.measured:
         lacking.append(ODOMETRY)
-    if not (lacking or run.ours):
-        lacking.append('topic of the controller of this package')
     return tuple(lacking)
 
 
