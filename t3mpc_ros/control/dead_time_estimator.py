@@ -244,7 +244,9 @@ class DeadTimeEstimator:
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
         dead_time: float = self._state['dead_time'].item() - self.lateness
-        if abs(dead_time - self._configured) <= USED_DIFFERENCE:
+        least = max(USED_DIFFERENCE, math.sqrt(USED_EVIDENCE) * self._state['deviation'].item())
+        # Neither is enough: the costs of a few blocks, or at the end of the grid, are no parabola.
+        if abs(dead_time - self._configured) <= least:
             return self._configured
         clear = self.evidence_against(self._configured + self.lateness) > USED_EVIDENCE
         return dead_time if clear else self._configured

@@ -435,6 +435,8 @@ def test_an_estimate_of_no_dead_time_is_as_certain_as_others():
     assert estimator.dead_time_in_use == 0.01
     shown(estimator, 0.0, 0.003)
     assert estimator.dead_time_in_use == 0.0
+    estimator.estimate.deviation = 0.0127  # a robot that stood, one block: no parabola
+    assert estimator.dead_time_in_use == 0.01
 
 
 def shown(estimator, dead_time, deviation):
