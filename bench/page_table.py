@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from t3mpc_ros.evaluation.result_formats import replace_section
+from t3mpc_ros.evaluation.result_output import replace_section
 
 
 class PageTable(NamedTuple):

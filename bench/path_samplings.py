@@ -25,6 +25,7 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.confidence_intervals import mean
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import errors_of
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS, PatrolScenario, run_patrol
 from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     SPACING,
@@ -34,7 +35,6 @@ from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     RegulatedParameters,
     TwistLimiter,
 )
-from t3mpc_ros.evaluation.patrol.tracking_study import errors_of
 from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_smoothing import SmoothedPath

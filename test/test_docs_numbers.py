@@ -27,12 +27,12 @@ import t3mpc_ros as t3
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.experiment import measured_run
 from t3mpc_ros.evaluation.method_table import methods_for
-from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
-from t3mpc_ros.evaluation.patrol.tracking_study import (
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     TRACKED_PATHS,
     TrackingPlan,
     compare_trackers,
 )
+from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.scenario import Scenario
 
 RESULTS = (ROOT / 'docs' / 'results.md').read_text()

@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.secret_random import SecretRandom
-from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.obstacles import OCCUPIED_PERCENT, OccupancyGrid
 from t3mpc_ros.geometry.path_timing import PathTiming
+from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.polyline import lengths_along, resample
 from t3mpc_ros.geometry.route_planning import SPACING, WAY_OUT, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle

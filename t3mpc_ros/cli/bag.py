@@ -317,7 +317,7 @@ class _RecoveryProgress:
         self._bar: Any = None
 
     def __call__(self, name: str, done: int, size: int) -> None:
-        from t3mpc_ros.evaluation.result_formats import progress_bar
+        from t3mpc_ros.evaluation.result_output import progress_bar
 
         if self._bar is None or name != self._name or done < self._bar.n:
             self.close()

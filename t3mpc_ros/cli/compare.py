@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.api.result_tables import writable
     from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.result_formats import columns_of, write_columns
+    from t3mpc_ros.evaluation.result_output import columns_of, write_columns
 
     plan = _plan(options)
     with shared_options.executor_of(options) as executor:

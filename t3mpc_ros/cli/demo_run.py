@@ -257,7 +257,7 @@ def _show(line: str) -> None:
 
 def _watch(processes: ProcessGroup, options: DemoOptions) -> None:
     """Wait for the duration of the run; a terminal gets a bar, anything else some lines."""
-    from t3mpc_ros.evaluation.result_formats import progress_bar
+    from t3mpc_ros.evaluation.result_output import progress_bar
 
     live = not options.headless and sys.stderr.isatty()
     start, next_line = time.monotonic(), 0.0

@@ -34,7 +34,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the table of the kinds."""
-    from t3mpc_ros.evaluation.open_loop_estimation import compare, records
+    from t3mpc_ros.evaluation.fuzzy_estimation_error import compare, records
     from t3mpc_ros.evaluation.paper.paper_tables import estimation
 
     results = compare(

@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     """Print the outcome of each fault; return 0 when every loop stayed bounded, else 1."""
     from t3mpc_ros.evaluation import fault_page
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.fault_study import FAULT_RUNS, study_faults
+    from t3mpc_ros.evaluation.fault_outcomes import FAULT_RUNS, study_faults
 
     known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
     for name in options.names:

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.figure_style import write_pictures
     from t3mpc_ros.evaluation.result_file import ResultFile
-    from t3mpc_ros.evaluation.result_formats import strict_json
+    from t3mpc_ros.evaluation.result_output import strict_json
 
     if options.safety:
         return _safety(options)
@@ -138,9 +138,9 @@ def _print_table(
 
 
 def _tune_tracking(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.patrol import tracking_page, tracking_study
+    from t3mpc_ros.evaluation.patrol import path_tracker_comparison, path_tracker_page
 
-    tune, markdown = tracking_study.tune_trackers, tracking_page.tuning_markdown
+    tune, markdown = path_tracker_comparison.tune_trackers, path_tracker_page.tuning_markdown
     return _print_table(options, tune, markdown, lambda found: found)
 
 
@@ -166,11 +166,11 @@ _Study = tuple[Any, Any, Callable[..., Any]]
 
 
 def _tracking(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import tracking_page, tracking_study
+    from t3mpc_ros.evaluation.patrol import path_tracker_comparison, path_tracker_page
 
-    paths = options.paths or tuple(tracking_study.TRACKED_PATHS)
-    plan = tracking_study.TrackingPlan(paths=paths, seeds=options.seeds)
-    return tracking_page, plan, tracking_study.compare_trackers
+    paths = options.paths or tuple(path_tracker_comparison.TRACKED_PATHS)
+    plan = path_tracker_comparison.TrackingPlan(paths=paths, seeds=options.seeds)
+    return path_tracker_page, plan, path_tracker_comparison.compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:

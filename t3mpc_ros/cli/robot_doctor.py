@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation import html_page, report_table, result_formats
+from t3mpc_ros.evaluation import html_page, report_table, result_output
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -155,7 +155,7 @@ def _write(checks: Sequence[Check], path: Path) -> None:
     print(headline, flush=True)
     data = path.with_suffix('.json')
     page = html_page.html_page('Bench checklist of the robot', blocks)
-    numbers = result_formats.strict_json([check._asdict() for check in checks])
+    numbers = result_output.strict_json([check._asdict() for check in checks])
     write_atomically(path, page)
     write_atomically(data, numbers)
     print(f'{path}, {data}: saved')

@@ -124,7 +124,7 @@ def print_result(
     options: argparse.Namespace, text: Callable[[], str], record: Callable[[], object]
 ) -> None:
     """Print a result as text, and write it to the file of ``--json``; ``-``: print only JSON."""
-    from t3mpc_ros.evaluation.result_formats import strict_json
+    from t3mpc_ros.evaluation.result_output import strict_json
 
     if options.json == STANDARD_OUTPUT:
         print(strict_json(record()), end='')

@@ -36,12 +36,12 @@ from typing import Any, Self, TypeVar
 
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
-from t3mpc_ros.evaluation.cluster_modules import ModuleCarrier
+from t3mpc_ros.evaluation.cluster_worker_modules import ModuleCarrier
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
+from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.loop_drivers import MethodSpec
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
-from t3mpc_ros.evaluation.result_formats import progress_bar
+from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parent_process import end_with_parent

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_formats
-from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
+from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation.fault_outcomes import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.figure_style import (
     COLOURS,
     drawing,
@@ -147,7 +147,7 @@ faster (root mean square) the wheels turn than they roll.
 
 def update_page(page: Path, rows: Sequence[Row]) -> None:
     """Replace the section between the marks of a page."""
-    result_formats.replace_section(page, BEGIN_MARK, END_MARK, page_section(rows))
+    result_output.replace_section(page, BEGIN_MARK, END_MARK, page_section(rows))
 
 
 def _short(reason: str) -> str:

@@ -24,7 +24,7 @@ from typing import Any
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.report_table import Mark, Table
-from t3mpc_ros.evaluation.result_formats import finite
+from t3mpc_ros.evaluation.result_output import finite
 from t3mpc_ros.page.assets import page_file
 
 

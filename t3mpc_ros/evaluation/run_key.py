@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.cluster_modules import is_own, own_text
+from t3mpc_ros.evaluation.cluster_worker_modules import is_own, own_text
 from t3mpc_ros.version import PACKAGE_DIRECTORY, VERSION
 
 DATA = (bool, int, float, complex, str, list, tuple, dict)
@@ -55,9 +55,9 @@ _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'model_file.py',
     'evaluation/bag_report/', 'evaluation/process_replay/', 'evaluation/comparison',
     'evaluation/fault_page.py', 'evaluation/html_page.py', 'evaluation/figure_style.py',
-    'evaluation/report_table.py', 'evaluation/result_formats.py', 'evaluation/result_file.py',
+    'evaluation/report_table.py', 'evaluation/result_output.py', 'evaluation/result_file.py',
     'evaluation/paper/',
-    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/tracking_page.py',
+    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/path_tracker_page.py',
 )  # fmt: skip
 
 

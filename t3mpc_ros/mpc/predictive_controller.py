@@ -25,7 +25,7 @@ import numpy as np
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.mpc.boltzmann_machine import LayerSizes, make_machine, reset_history
-from t3mpc_ros.mpc.predictor import (
+from t3mpc_ros.mpc.online_learning_predictor import (
     LearningConstants,
     Predictor,
     WheelState,

@@ -43,7 +43,7 @@ from t3mpc_ros.bag.snapshot import (
 from t3mpc_ros.bag.topic_filter import TopicFilter, resolve_name
 from t3mpc_ros.bag.writer import BagWriter, FolderError, FolderInUseError
 from t3mpc_ros.bag.writer_thread import WriterThread
-from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
+from t3mpc_ros.chaos.salted_seed_hash import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode

@@ -41,7 +41,7 @@ from t3mpc_ros.chaos.pose_reference import (
     TwistSource,
 )
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceSample
-from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
+from t3mpc_ros.chaos.salted_seed_hash import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_from_frame
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.polyline import PathError, check_points

@@ -30,10 +30,10 @@ from t3mpc_ros.chaos.path_replanning import (
 )
 from t3mpc_ros.chaos.pose_reference import PathReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
-from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.route_planning import nearest_distances
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, Pose
 from t3mpc_ros.parameters.table import ParameterError

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from t3mpc_ros.chaos.salted_seed_hash import fingerprint_seed, matches_fingerprint
 from t3mpc_ros.chaos.secret_random import SecretRandom
-from t3mpc_ros.chaos.seed_fingerprint import fingerprint_seed, matches_fingerprint
 
 SALT = bytes(range(16))
 

@@ -94,7 +94,7 @@ def graph(**answers):
 
 def studied(*verdicts):
     return {
-        'evaluation.fault_study.study_faults': [{'verdict': v} for v in verdicts],
+        'evaluation.fault_outcomes.study_faults': [{'verdict': v} for v in verdicts],
         'evaluation.fault_page.console_text': '',
     }
 

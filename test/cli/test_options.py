@@ -35,7 +35,7 @@ from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.comparison_runs import compare
 from t3mpc_ros.evaluation.api.parameter_sweep import sweep
 from t3mpc_ros.evaluation.bag_report.animation_file import AnimationOptions
-from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
+from t3mpc_ros.evaluation.fuzzy_estimation_error import compare as compare_estimators
 from t3mpc_ros.evaluation.paper.paper_study import chosen_extent
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
 from t3mpc_ros.evaluation.process_replay import replay_comparison

@@ -109,7 +109,7 @@ def context(value):
 
 
 SHARED = {'evaluation.api.parameter_sweep.cluster': context(5)}
-CSV = 'time,right,left\n' + ''.join(f'{0.01 * k:.2f},1.0,2.0\n' for k in range(300))
+CSV = 'time,right,left\n' + ''.join(f'{k},1.0,2.0\n' for k in range(100))
 OWN_RATE = tuple([0.0, 0.0] for _ in range(6100))
 """Slope of that reference over a run and a second."""
 FILES = {
@@ -154,20 +154,20 @@ COMPARE = {
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
-    for name in ('patrol', 'tracking')
+    for name in ('patrol', 'path_tracker')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.figure_style.write_pictures': {},
     'evaluation.patrol.patrol_comparison.compare_patrols': SimpleNamespace(
         table=SimpleNamespace(keys=())
     ),
-    'evaluation.patrol.tracking_study.compare_trackers': SimpleNamespace(
+    'evaluation.patrol.path_tracker_comparison.compare_trackers': SimpleNamespace(
         table=SimpleNamespace(keys=())
     ),
-    'evaluation.patrol.tracking_study.tune_trackers': {},
+    'evaluation.patrol.path_tracker_comparison.tune_trackers': {},
     'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
-    'evaluation.patrol.tracking_page.tuning_markdown': '',
+    'evaluation.patrol.path_tracker_page.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }
@@ -195,7 +195,7 @@ OF_BAGS = {
     '--output new.npz': {'save_model.path': 'new.npz'},
 }
 FAULTS = {
-    'evaluation.fault_study.study_faults': [],
+    'evaluation.fault_outcomes.study_faults': [],
     'evaluation.fault_page.console_text': '',
     'evaluation.fault_page.update_page': None,
     'evaluation.fault_page.page': '',
@@ -295,7 +295,7 @@ def link(path, *, key=True):
 
 TABLE = {
     'estimation': (
-        {'evaluation.open_loop_estimation.compare': ResultTable([])},
+        {'evaluation.fuzzy_estimation_error.compare': ResultTable([])},
         {
             '--seeds 6-7': {'compare.seeds': (6, 7)},
             '--duration 9': {'compare.duration': 9.0},

@@ -26,7 +26,7 @@ import pytest
 from t3mpc_ros.evaluation import run_key
 from t3mpc_ros.evaluation.experiment import JobError, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.result_file import ResultFile
-from t3mpc_ros.evaluation.result_formats import progress_bar
+from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_key import content_of, digest, source_digest
 
 ROWS = [

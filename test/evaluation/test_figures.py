@@ -41,12 +41,16 @@ from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.paper_study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.paper.paper_tables import Results
-from t3mpc_ros.evaluation.patrol import patrol_page, tracking_page
+from t3mpc_ros.evaluation.patrol import path_tracker_page, patrol_page
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import OURS as TRACKER
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
+    TRACKED_PATHS,
+    TrackingPlan,
+    TrackingStudy,
+)
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, visits
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.patrol.tracking_study import OURS as TRACKER
-from t3mpc_ros.evaluation.patrol.tracking_study import TRACKED_PATHS, TrackingPlan, TrackingStudy
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,
@@ -610,7 +614,7 @@ def test_tracked_paths_have_the_drives_of_their_methods():
          for (path, method), track in tracks.items()]
     )  # fmt: skip
     study = TrackingStudy(TrackingPlan(paths, (1,), methods), table)
-    first, second, *empty = tracking_page.draw_tracks(study).axes
+    first, second, *empty = path_tracker_page.draw_tracks(study).axes
     for axis, path in zip((first, second), paths, strict=True):
         shown = lines(axis)
         assert shown.keys() == colours.keys()

@@ -41,7 +41,7 @@ from t3mpc_ros.evaluation.paper.figure_runs import explained, follows_claim, swi
 from t3mpc_ros.evaluation.paper.paper_figures import floor_path, largest_switch
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables
 from t3mpc_ros.evaluation.paper.reproduce import EXHIBITS, RUNS, counted, reproduce
-from t3mpc_ros.evaluation.result_formats import finite
+from t3mpc_ros.evaluation.result_output import finite
 from t3mpc_ros.evaluation.run_record import switch_times
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry

@@ -16,8 +16,8 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.path_file import load_path
+from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.polyline import PathError
 from t3mpc_ros.parameters.table import ParameterError
 

@@ -26,7 +26,7 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     reset_history,
     set_visible,
 )
-from t3mpc_ros.mpc.predictor import (
+from t3mpc_ros.mpc.online_learning_predictor import (
     LearningConstants,
     Predictor,
     authority,

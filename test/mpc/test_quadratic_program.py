@@ -21,7 +21,7 @@ from scipy.optimize import lsq_linear
 from support.equations import cost, unconstrained_optimum
 from support.properties import PROPERTY
 
-from t3mpc_ros.mpc.predictor import toeplitz
+from t3mpc_ros.mpc.online_learning_predictor import toeplitz
 from t3mpc_ros.mpc.quadratic_program import (
     INFEASIBLE,
     NOT_POSITIVE,

@@ -30,7 +30,7 @@ from support.ros_graph import diagnostic_level
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.pose_reference import PortraitSource
 from t3mpc_ros.chaos.reference import ChaoticReference
-from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
+from t3mpc_ros.chaos.salted_seed_hash import matches_fingerprint
 from t3mpc_ros.control.range_fault_detection import RangeFault
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist

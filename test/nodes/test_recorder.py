@@ -40,7 +40,7 @@ from support.waiting import wait_for_acknowledgement
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording_metadata import SEED_RECORD, RecordingMetadata
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
+from t3mpc_ros.chaos.salted_seed_hash import matches_fingerprint
 from t3mpc_ros.model_file import find_model, load_model, save_model
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode

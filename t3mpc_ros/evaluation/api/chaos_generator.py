@@ -29,7 +29,7 @@ from t3mpc_ros.chaos.system_equations import QuadraticSystem, hyperchaotic_syste
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
 from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.evaluation.api.result_tables import drawn, writable
-from t3mpc_ros.evaluation.result_formats import write_columns
+from t3mpc_ros.evaluation.result_output import write_columns
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.script_error import ScriptError
 

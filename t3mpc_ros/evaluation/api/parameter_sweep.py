@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.experiment import (
 )
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
-from t3mpc_ros.evaluation.result_formats import columns_of
+from t3mpc_ros.evaluation.result_output import columns_of
 from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names

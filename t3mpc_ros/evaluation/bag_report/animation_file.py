@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import tracking_error
 from t3mpc_ros.evaluation.figure_style import COLOURS, STYLE, draw_world
-from t3mpc_ros.evaluation.result_formats import progress_bar
+from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH, ReportError, ReportOptions
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
 from t3mpc_ros.parameters.command_line import parsed_value

@@ -28,7 +28,7 @@ from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Seri
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
-from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.run_record import ON_PATH
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array

@@ -37,7 +37,7 @@ from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
-from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline

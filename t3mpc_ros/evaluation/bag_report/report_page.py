@@ -52,7 +52,7 @@ from t3mpc_ros.evaluation.html_page import (
     html_page,
 )
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.run_record import ROBOT_WINDOW, START, counted_from, spans_of
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,

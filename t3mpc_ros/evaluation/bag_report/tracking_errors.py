@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.bag_report import incidents
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.run_record import ROBOT_WINDOW, counted_from, counted_rows
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array

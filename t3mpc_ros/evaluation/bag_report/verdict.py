@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     settled_rmse,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.result_formats import format_number
+from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.run_record import ON_PATH, counted_from
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array

@@ -24,8 +24,7 @@ from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.experiment import map_jobs, recorded_run
-from t3mpc_ros.evaluation.method_table import FULL, methods
-from t3mpc_ros.evaluation.open_loop_estimation import (
+from t3mpc_ros.evaluation.fuzzy_estimation_error import (
     KINDS,
     NORMALISED_GAIN,
     SETTLE,
@@ -34,6 +33,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     simulate_open_loop,
     torque_robot,
 )
+from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
 from t3mpc_ros.evaluation.paper.paper_study import PAPER_NOISE, SETTLING, WITHOUT, Extent
 from t3mpc_ros.evaluation.paper.paper_tables import Results, rank

@@ -20,8 +20,8 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
+from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.experiment import Run
-from t3mpc_ros.evaluation.loop_drivers import MethodSpec
 from t3mpc_ros.evaluation.method_table import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.method_table import methods
 from t3mpc_ros.evaluation.run_key import digest

@@ -23,7 +23,7 @@ from t3mpc_ros.evaluation.method_table import FULL
 from t3mpc_ros.evaluation.paper.paper_study import PAPER_NOISE, STAGES, WITHOUT
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
-from t3mpc_ros.evaluation.result_formats import columns_of, finite
+from t3mpc_ros.evaluation.result_output import columns_of, finite
 
 SITUATION = ('drive', 'noise', 'case')
 _GROUP = ('controller', 'baseline', 'preview', *SITUATION)

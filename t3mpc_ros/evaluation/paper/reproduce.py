@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation import html_page, open_loop_estimation, report_table, result_formats
+from t3mpc_ros.evaluation import fuzzy_estimation_error, html_page, report_table, result_output
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.figure_style import write_pictures
 from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
@@ -62,8 +62,8 @@ def reproduce(
     showcase = figure_runs.simulate_figure_runs(extent, results, workers)
     write('  estimation without a controller (86)')
     alone = estimation_seeds or tuple(range(1, 3 if quick else 21))
-    variances = (0.0, 0.04) if quick else open_loop_estimation.VARIANCES
-    estimated = open_loop_estimation.compare(
+    variances = (0.0, 0.04) if quick else fuzzy_estimation_error.VARIANCES
+    estimated = fuzzy_estimation_error.compare(
         seeds=alone, duration=extent.duration, variances=variances
     )
     write('  figures and page')
@@ -92,16 +92,16 @@ def reproduce(
         'exact_models': exact,
         'stage_differences': results.added.rows,
         'losses': results.lost.rows,
-        'estimation': open_loop_estimation.records(estimated),
+        'estimation': fuzzy_estimation_error.records(estimated),
         'claims': [claim.record() for claim in claims],
     }
     output.mkdir(parents=True, exist_ok=True)
-    (output / 'results.json').write_text(result_formats.strict_json(content), encoding='utf-8')
+    (output / 'results.json').write_text(result_output.strict_json(content), encoding='utf-8')
     origin = provenance() | machine()
-    result_formats.write_columns(
+    result_output.write_columns(
         output / 'runs.csv', csv_columns([row | origin for row in results.runs])
     )
-    result_formats.write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
+    result_output.write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     drawn = write_pictures(
         {each.stem: each.draw for each in EXHIBITS if each.draw}, material, output / 'figures'

@@ -43,9 +43,9 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.run_record import Record
-from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
+from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.robot.sensor_mounts import ray_ends, sensor_mounts

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_formats
+from t3mpc_ros.evaluation import html_page, report_table, result_output
 from t3mpc_ros.evaluation.confidence_intervals import (
     Difference,
     format_interval,
@@ -205,7 +205,7 @@ def surprise_table(study: PatrolStudy) -> report_table.Table:
 
 
 def _cell(rows: Sequence[Row], column: str, digits: int = 3, factor: float = 1.0) -> str:
-    return result_formats.format_mean(
+    return result_output.format_mean(
         [factor * row[column] for row in rows if column in row], digits
     )
 

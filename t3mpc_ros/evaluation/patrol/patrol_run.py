@@ -40,9 +40,9 @@ from t3mpc_ros.evaluation.loop import reports_of, run_loop
 from t3mpc_ros.evaluation.patrol.pure_pursuit import PathTracker
 from t3mpc_ros.evaluation.run_record import ON_PATH, RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
-from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,

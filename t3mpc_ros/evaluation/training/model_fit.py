@@ -25,8 +25,8 @@ from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingEr
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.boltzmann_machine import BoltzmannMachine, LayerSizes, make_machine
+from t3mpc_ros.mpc.online_learning_predictor import Predictor
 from t3mpc_ros.mpc.predictive_controller import PredictiveParameters, learning_constants
-from t3mpc_ros.mpc.predictor import Predictor
 from t3mpc_ros.mpc.pretraining import SampleTiming, nominal_step_response
 
 # -- predictor ------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from t3mpc_ros.evaluation.experiment import Job, JobError, Report, WorkerPool
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method_table import FULL, further_methods, methods, twin_start
 from t3mpc_ros.evaluation.proposed_method import ProposedController
-from t3mpc_ros.evaluation.result_formats import progress_bar
+from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import START, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import search_best

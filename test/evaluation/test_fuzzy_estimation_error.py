@@ -20,9 +20,9 @@ import pytest
 from support.equations import wheel_coriolis
 
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation import open_loop_estimation
+from t3mpc_ros.evaluation import fuzzy_estimation_error
 from t3mpc_ros.evaluation.confidence_intervals import mean
-from t3mpc_ros.evaluation.open_loop_estimation import (
+from t3mpc_ros.evaluation.fuzzy_estimation_error import (
     KINDS,
     NO_FUZZY_SYSTEM,
     OUTPUT_ERROR_GAIN,
@@ -185,7 +185,7 @@ def test_the_program_prints_the_table_and_writes_the_numbers(tmp_path, capsys, m
     path = tmp_path / 'figures.json'
     assert main(['estimation', '--duration', '10']) == 1
     assert 'duration must be more than 10 s' in capsys.readouterr().err
-    monkeypatch.setattr(open_loop_estimation, 'SETTLE', 1.0)
+    monkeypatch.setattr(fuzzy_estimation_error, 'SETTLE', 1.0)
     words = ['estimation', '--duration', '2', '--json', str(path), '--seeds']
     assert main([*words, '1-2']) == 0
     said = capsys.readouterr().out

@@ -24,9 +24,9 @@ from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation import fault_page, fault_study
+from t3mpc_ros.evaluation import fault_outcomes, fault_page
+from t3mpc_ros.evaluation.controller_adapters import NodeMethod
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.loop_drivers import NodeMethod
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario, noisy_twin, sampled_speeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
@@ -46,7 +46,9 @@ def short_run(*events, duration=6.0, pauses=(), **changes):
 
 
 def fault_run(course, name):
-    (found,) = (one for one in fault_study.FAULT_RUNS if (one.course, one.name) == (course, name))
+    (found,) = (
+        one for one in fault_outcomes.FAULT_RUNS if (one.course, one.name) == (course, name)
+    )
     return found
 
 
@@ -139,13 +141,13 @@ SHORT = ('gyro_bias_jump 0.35 rad/s', 'command_delay 0.1 s')
 @pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), 1))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
-    (result,) = fault_study.study_faults([fault_run('chaotic', name)])
+    (result,) = fault_outcomes.study_faults([fault_run('chaotic', name)])
     assert (result['verdict'], result['reason'], result['resumption']) == EXPECTED[name]
     assert_same(row_text(result), page_rows()['chaotic', name])
 
 
 def test_every_fault_is_among_those_expected():
-    assert [name.split()[0] for name in EXPECTED] == list(FAULTS) == list(fault_study.STRENGTHS)
+    assert [name.split()[0] for name in EXPECTED] == list(FAULTS) == list(fault_outcomes.STRENGTHS)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +162,7 @@ def test_every_fault_is_among_those_expected():
     ),
 )
 def test_undetected_faults_are_named(course, name):
-    (result,) = fault_study.study_faults([fault_run(course, name)])
+    (result,) = fault_outcomes.study_faults([fault_run(course, name)])
     assert not result['detected']
     assert 'odometry is wrong' in result['undetected']
     line = row_text(result)
@@ -170,7 +172,7 @@ def test_undetected_faults_are_named(course, name):
 
 
 def test_the_page_has_a_row_for_every_trial_and_no_other():
-    assert list(page_rows()) == [(one.course, one.name) for one in fault_study.FAULT_RUNS]
+    assert list(page_rows()) == [(one.course, one.name) for one in fault_outcomes.FAULT_RUNS]
     names = {name.split()[0] for _, name in page_rows()}
     assert names >= {*FAULTS}
     assert {line.count('|') for line in page_rows().values()} == {7}
@@ -186,22 +188,22 @@ AT = fault_run('chaotic', 'gyro_dead')
 
 
 def judged(record, parameters=None):
-    undisturbed_run = fault_study.undisturbed('chaotic', AT.duration)
-    return fault_study.evaluate_outcome(
+    undisturbed_run = fault_outcomes.undisturbed('chaotic', AT.duration)
+    return fault_outcomes.evaluate_outcome(
         record, undisturbed_run, 10.0, 15.0, parameters or noisy_twin()
     )
 
 
 def changed(column, rows, value):
     """Return the run without a fault with another value in some rows of a column."""
-    record = fault_study.undisturbed('chaotic', AT.duration)
+    record = fault_outcomes.undisturbed('chaotic', AT.duration)
     values = record[column].copy()
     values[rows] = value
     return replace(record, columns={**record.columns, column: values})
 
 
 def test_a_run_without_fault_is_bounded_and_notices_nothing():
-    result = judged(fault_study.undisturbed('chaotic', AT.duration))
+    result = judged(fault_outcomes.undisturbed('chaotic', AT.duration))
     found = [result[name] for name in ('verdict', 'recovery_time', 'detected', 'undetected')]
     assert found == ['bounded', 0.0, [], []]
     result |= {'name': AT.name, 'course': 'arc'}
@@ -211,7 +213,7 @@ def test_a_run_without_fault_is_bounded_and_notices_nothing():
 
 def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
     """A slip stop once lasted for no more than a period, and only the reason stayed."""
-    record = fault_study.undisturbed('chaotic', AT.duration)
+    record = fault_outcomes.undisturbed('chaotic', AT.duration)
     says = tuple(SLIP_STOP_REASON if 11.0 <= time < 15.0 else '' for time in record.time)
     result = judged(replace(record, robot_reasons=says))
     assert result['verdict'] == 'unbounded'
@@ -227,7 +229,7 @@ def test_speeds_beyond_the_limits_are_unbounded(field, value):
 
 
 def test_a_lasting_error_is_impaired_a_passing_one_recovers():
-    speeds = fault_study.undisturbed('chaotic', AT.duration).speeds
+    speeds = fault_outcomes.undisturbed('chaotic', AT.duration).speeds
     lasting, passing = slice(1500, None), slice(1500, 2000)
     result = judged(changed('speeds', lasting, speeds[lasting] + 1.0))
     assert result['verdict'] == 'impaired'
@@ -244,10 +246,10 @@ def two(monkeypatch):
     """Let the command make two short trials only."""
     event = FaultEvent(10.0, 'gyro_dead', True, 2.0)
     made = tuple(
-        fault_study.FaultRun('gyro_dead', course, event, '', 17.0)
+        fault_outcomes.FaultRun('gyro_dead', course, event, '', 17.0)
         for course in ('chaotic', 'straight')
     )
-    monkeypatch.setattr(fault_study, 'FAULT_RUNS', made)
+    monkeypatch.setattr(fault_outcomes, 'FAULT_RUNS', made)
 
 
 @pytest.mark.long

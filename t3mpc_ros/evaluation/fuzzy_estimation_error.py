@@ -33,7 +33,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.result_formats import progress_bar
+from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.geometry.types import Array

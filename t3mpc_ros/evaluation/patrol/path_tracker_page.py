@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_formats
+from t3mpc_ros.evaluation import html_page, report_table, result_output
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.figure_style import TitledDrawing, new_figure
-from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
-from t3mpc_ros.evaluation.patrol.tracking_study import (
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     ARRIVED,
     OURS,
     TRACKED_PATHS,
@@ -31,6 +30,7 @@ from t3mpc_ros.evaluation.patrol.tracking_study import (
     TrackingPlan,
     TrackingStudy,
 )
+from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.version import VERSION
 
 VERDICTS = {1: 'ours is better', -1: 'ours is worse', 0: 'inconclusive'}
@@ -50,7 +50,7 @@ def path_table(study: TrackingStudy, path: str) -> report_table.Table:
         rows = study.table.where(path=path, controller=name)
         line: list[str | report_table.Mark] = [name]
         for column in ('cross_track', 'largest', 'timed'):
-            line.append(result_formats.format_mean([1e3 * row[column] for row in rows], 2))
+            line.append(result_output.format_mean([1e3 * row[column] for row in rows], 2))
         line.append(_time([row['time'] for row in rows]))
         line.append('yes' if all(row['within_limits'] for row in rows) else 'no')
         own = {'path': path, 'controller': OURS}
@@ -76,7 +76,7 @@ def summary_table(study: TrackingStudy) -> report_table.Table:
             own = {'path': path, 'controller': OURS}
             above = study.table.difference('cross_track', {**own, 'controller': name}, own)
             judged = f'; {VERDICTS[above.sign]}' if name != OURS and above is not None else ''
-            line.append(result_formats.format_mean(errors, 2) + judged)
+            line.append(result_output.format_mean(errors, 2) + judged)
         lines.append(line)
     return report_table.Table(
         'Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,)
@@ -136,7 +136,7 @@ def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
 
 
 def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:
-    """Return the choices of :func:`.tracking_study.tune_trackers` as tables in Markdown."""
+    """Return the choices of :func:`.path_tracker_comparison.tune_trackers` in Markdown."""
     tables = [
         report_table.Table(
             f'{name}, seeds {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}',

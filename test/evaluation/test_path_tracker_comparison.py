@@ -25,14 +25,8 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.patrol import tracking_page
-from t3mpc_ros.evaluation.patrol.pure_pursuit import (
-    PurePursuitParameters,
-    Pursuit,
-    RegulatedParameters,
-    pursuit_curvature,
-)
-from t3mpc_ros.evaluation.patrol.tracking_study import (
+from t3mpc_ros.evaluation.patrol import path_tracker_page
+from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     METHODS,
     OURS,
     TRACKED_PATHS,
@@ -46,6 +40,12 @@ from t3mpc_ros.evaluation.patrol.tracking_study import (
     recorded_path,
     straight_line,
     tuning_grids,
+)
+from t3mpc_ros.evaluation.patrol.pure_pursuit import (
+    PurePursuitParameters,
+    Pursuit,
+    RegulatedParameters,
+    pursuit_curvature,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.polyline import distance_to_path, resample
@@ -202,7 +202,8 @@ def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
         for seed, error in enumerate(errors)
     ]  # fmt: skip
     plan = TrackingPlan(('square',), (0, 1, 2), tuple(times))
-    text = tracking_page.path_table(TrackingStudy(plan, ResultTable(rows)), 'square').markdown()
+    study = TrackingStudy(plan, ResultTable(rows))
+    text = path_tracker_page.path_table(study, 'square').markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))
     assert row.endswith(f'| {verdict} |')
     assert 'arrived in 0 of 3' in row
