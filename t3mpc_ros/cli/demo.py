@@ -21,6 +21,7 @@ import sys
 import webbrowser
 
 from t3mpc_ros.cli.shared_options import SECONDS, Commands, new_folder
+from t3mpc_ros.parameters.command_line import bounded_int
 
 UNSOUND, TOO_SLOW = 3, 4
 """Exit codes of a demo that was recorded but is no valid measurement."""
@@ -43,7 +44,7 @@ def add_parser(commands: Commands) -> None:
     demo.add_argument('--output', type=new_folder, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
     demo.add_argument('--view', action='store_true', help='show the run on a live page')
-    demo.add_argument('--seed', type=int, help='seed of reference and robot')
+    demo.add_argument('--seed', type=bounded_int(0, 10**15), help='seed of reference and robot')
     text = 'patrol the world room on a chaotic path; without --seed it is unpredictable'
     demo.add_argument('--patrol', action='store_true', help=text)
     text = (

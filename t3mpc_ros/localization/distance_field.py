@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.map_file import MAX_CELLS, MapError, load_map
 from t3mpc_ros.geometry.obstacles import OCCUPIED_PERCENT
+from t3mpc_ros.geometry.occupancy_map_file import MAX_CELLS, MapError, load_map
 from t3mpc_ros.geometry.route_planning import nearest_distances
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel

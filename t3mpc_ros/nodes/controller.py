@@ -379,7 +379,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         return '', f'saved {path.resolve()}'
 
     def _save_map(self) -> tuple[str, str]:
-        from t3mpc_ros.geometry.map_file import MapError, save_map
+        from t3mpc_ros.geometry.occupancy_map_file import MapError, save_map
 
         assert self._controller.keep_out is not None
         path = Path(self.parameters.map_output)
@@ -522,7 +522,7 @@ def _saved_map(parameters: ControllerNodeParameters) -> OccupancyGrid | None:
     """Return the map with which the keep-out begins, if there is one."""
     if not parameters.keep_out.yaml_filename:
         return None
-    from t3mpc_ros.geometry.map_file import MapError, load_map
+    from t3mpc_ros.geometry.occupancy_map_file import MapError, load_map
 
     try:
         return load_map(parameters.keep_out.yaml_filename)

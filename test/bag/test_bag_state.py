@@ -26,7 +26,7 @@ from support.properties import PROPERTY, STATEFUL
 from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ScheduledMessage
-from t3mpc_ros.bag.snapshot import CircularMessageCache
+from t3mpc_ros.bag.snapshot_ring_buffer import CircularMessageCache
 from t3mpc_ros.bag.writer import BagWriter
 
 SECOND, MS = 10**9, 10**6

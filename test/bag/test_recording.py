@@ -31,7 +31,7 @@ from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recorder_parameters import RecordingParameters
-from t3mpc_ros.bag.snapshot import (
+from t3mpc_ros.bag.snapshot_ring_buffer import (
     REPORT_TIMEOUT_NS,
     CircularMessageCache,
     DiagnosticsMonitor,

@@ -203,6 +203,7 @@ CASES = [
         (words, {}, 2, text)
         for words, text in {
             'demo --duration 0': 'must be from 1 to 86400 seconds: got 0',
+            'demo --seed -1': 'argument --seed: must be from 0 to 1e+15: got -1',
             'demo --output key': 'must be a folder, or the path of a new one: got key',
             'demo --output key/a/b': 'of a new one: got key/a/b, and key is a file',
             "demo --output ''": "must name a folder, . for this one: got ''",

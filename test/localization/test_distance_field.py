@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 import yaml
 
-from t3mpc_ros.geometry.map_file import MapError, load_map, save_map
 from t3mpc_ros.geometry.obstacles import OccupancyGrid
+from t3mpc_ros.geometry.occupancy_map_file import MapError, load_map, save_map
 from t3mpc_ros.localization.distance_field import load_grid, map_of_grid, map_of_world, trace_ray
 from t3mpc_ros.simulation.world import cast_ray, load_world
 

@@ -34,7 +34,7 @@ from support.ros_graph import (
     stamp,
 )
 
-from t3mpc_ros.geometry.map_file import load_map
+from t3mpc_ros.geometry.occupancy_map_file import load_map
 from t3mpc_ros.model_file import ModelError, load_model
 from t3mpc_ros.nodes import controller as controller_module
 from t3mpc_ros.nodes import topic_endpoints

@@ -37,8 +37,8 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     inputs_of,
     motions,
 )
-from t3mpc_ros.geometry.map_file import MapError, load_map
 from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
+from t3mpc_ros.geometry.occupancy_map_file import MapError, load_map
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist
 from t3mpc_ros.simulation.world import WorldError, load_world
 
