@@ -381,8 +381,9 @@ class BodyCorrection:
         if rough > ROUGH:
             return (
                 f'the yaw rate of odom is rough by {rough * self._turn:.4f} rad/s beyond the '
-                'commands: commands are lost, the floor is uneven, a wheel is loose, or the gyro, '
-                'or whatever else gives the yaw, is noisy'
+                'commands: commands are lost, the floor is uneven, a wheel is loose, the gyro, or '
+                'whatever else gives the yaw, is noisy, or its bias is unknown because the robot '
+                'has not stood for 1 s since its start'
             )
         return ''
 

@@ -236,11 +236,6 @@ def state_warnings(
         found.append('a wheel slips, is blocked, or has lost steps')
     if status.imu_fault:
         found.append('the inertial sensor does not answer')
-    elif state.gyro_waits and any(state.commanded):
-        found.append(
-            'the yaw is that of the wheels alone: the bias of the gyro is not known; let the '
-            'robot stand for 1 s'
-        )
     if status.low_battery:
         volts = f': {state.battery.voltage:.1f} V' if state.battery else ''
         found.append(f'the battery is low{volts}')

@@ -318,7 +318,6 @@ class RadioRobot(interface.RobotInterface):
             imu=telemetry.imu,
             ranges=telemetry.ranges,
             battery=self.link.battery,
-            gyro_waits=self._odometry.gyro_waits,
         )
 
     def _initial_state(self) -> interface.RobotState:

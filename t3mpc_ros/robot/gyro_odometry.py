@@ -232,11 +232,6 @@ class GyroOdometry:
         return bool(self._memory[0].calibrated)
 
     @property
-    def gyro_waits(self) -> bool:
-        """Whether the gyro is to be used, and its bias is not known."""
-        return self._parameters.use_gyro and not self.calibrated
-
-    @property
     def slipping(self) -> bool:
         """Whether gyro and steps have disagreed for ``slip_time``: a wheel slips or is blocked."""
         return bool(self._memory[0].slipping)

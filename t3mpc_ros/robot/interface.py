@@ -92,8 +92,6 @@ class RobotState(NamedTuple):
     battery: BatteryReading | None = None  # none if not measured
     lost_steps: tuple[int, int] | None = None
     """Full steps the rotors are behind their fields, right first: known only in simulation."""
-    gyro_waits: bool = False
-    """Whether the odometry does not use the gyro, whose bias no standstill has shown yet."""
 
 
 class RobotInterface(Protocol):

@@ -475,7 +475,6 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             ranges=() if self._faults.ranges_dead else self._ranges.readings,
             battery=self._supply,
             lost_steps=drivetrain.lost_steps,
-            gyro_waits=odometry.gyro_waits,
         )
 
     def _moving(self) -> bool:

@@ -393,7 +393,7 @@ def test_count_variance_is_that_of_quantisation():
 # -- diagnostics ----------------------------------------------------------------------------------
 
 
-def _state(reason='', lost=(0, 0), gyro_waits=False, **status):
+def _state(reason='', lost=(0, 0), **status):
     flags = {'enabled': True, 'moving': False, 'estop': False, 'timed_out': False} | status
     return RobotState(
         stamp_ns=0,
@@ -401,12 +401,11 @@ def _state(reason='', lost=(0, 0), gyro_waits=False, **status):
         angles=WheelAngles(0.0, 0.0),
         odometry=State(0, Pose(0, 0, 0), BodyTwist(0, 0)),
         covariance=np.zeros((3, 3)),
-        commanded=WheelSpeeds(1.0, 1.0),
+        commanded=ZERO_WHEEL_SPEEDS,
         status=RobotStatus(limited=False, **flags),
         reason=reason,
         battery=BatteryReading(9.87, 0.5, 0.1),
         lost_steps=lost,
-        gyro_waits=gyro_waits,
     )
 
 
@@ -419,8 +418,6 @@ def _state(reason='', lost=(0, 0), gyro_waits=False, **status):
         (_state(slipping=True), (), ['a wheel slips']),
         (_state(SLIP_STOP_REASON, slipping=True), (), ['gyro and steps disagree']),
         (_state(imu_fault=True), (), ['inertial sensor does not answer']),
-        (_state(gyro_waits=True), (), ['let the robot stand for 1 s']),
-        (_state(imu_fault=True, gyro_waits=True), (), ['inertial sensor does not answer']),
         (_state(low_battery=True), (), ['battery is low: 9.9 V']),
         (_state(lost=(4, -8)), (), ['steps lost: 4 right, -8 left']),
         (_state('why', imu_fault=True), (), ['why', 'inertial sensor']),

@@ -201,7 +201,6 @@ def test_without_calibrated_gyro_equals_wheel_odometry(gyro_state):
     assert odometry.pose == pytest.approx(plain.pose, abs=1e-12)
     assert odometry.covariance == pytest.approx(plain.covariance, rel=1e-10, abs=1e-18)
     assert odometry.calibrated == (gyro_state == 'failed')
-    assert odometry.gyro_waits == (gyro_state in ('none', 'unknown bias'))
     assert not odometry.slipping
 
 
