@@ -35,11 +35,7 @@ def message_loss_record(
     dropped: Mapping[str, int], lost: Mapping[str, int], undiscovered: Mapping[str, int]
 ) -> dict[str, str]:
     """Return the metadata record of missing messages, by cause (:data:`LOSS_CAUSES`) and topic."""
-    causes = dict(zip(LOSS_CAUSES, (dropped, lost, undiscovered), strict=False))
-    table = {cause: str(sum(counts.values())) for cause, counts in causes.items()}
-    for cause, counts in causes.items():
-        table |= {f'{cause} {topic}': str(count) for topic, count in sorted(counts.items())}
-    return table
+    return _record_of({'dropped': dropped, 'lost': lost, UNDISCOVERED: undiscovered})
 
 
 def damage_record(lost: Mapping[str, int], spans: Iterable[tuple[int, int]]) -> dict[str, str]:
@@ -47,9 +43,21 @@ def damage_record(lost: Mapping[str, int], spans: Iterable[tuple[int, int]]) -> 
 
     Those are of some spans of receive times, ns.
     """
-    table = {DAMAGED: str(sum(lost.values()))}
-    table |= {f'{DAMAGED} {topic}': str(count) for topic, count in sorted(lost.items())}
-    return table | {f'{_SPAN} {k}': f'{low} {high}' for k, (low, high) in enumerate(spans)}
+    times = {f'{_SPAN} {k}': f'{low} {high}' for k, (low, high) in enumerate(spans)}
+    return _record_of({DAMAGED: lost}) | times
+
+
+def _record_of(causes: Mapping[str, Mapping[str, int]]) -> dict[str, str]:
+    """Return the sum of each cause, and the number of each cause and topic."""
+    table = {cause: str(sum(counts.values())) for cause, counts in causes.items()}
+    for cause, counts in causes.items():
+        table |= {f'{cause} {topic}': str(count) for topic, count in sorted(counts.items())}
+    return table
+
+
+def is_loss_record(title: str) -> bool:
+    """Whether a metadata record, by its name, is one of missing messages."""
+    return title.split(' ')[0] == LOSSES
 
 
 def lost_spans(tables: Mapping[str, Mapping[str, str]]) -> list[tuple[int, int]]:
@@ -64,7 +72,7 @@ def lost_spans(tables: Mapping[str, Mapping[str, str]]) -> list[tuple[int, int]]
 
 
 def _loss_tables(tables: Mapping[str, Mapping[str, str]]) -> list[Mapping[str, str]]:
-    return [table for title, table in tables.items() if title.split(' ')[0] == LOSSES]
+    return [table for title, table in tables.items() if is_loss_record(title)]
 
 
 def message_losses(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, int]]:

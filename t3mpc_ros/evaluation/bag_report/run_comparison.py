@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
+from t3mpc_ros.bag.message_losses import is_loss_record
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report import report_charts
 from t3mpc_ros.evaluation.bag_report.incidents import driving
@@ -244,7 +245,7 @@ def _load(number: int, folder: Path, path: Path, wanted: ReportOptions | None) -
     parameters = {
         f'{node} {name}': value
         for node, table in records.items()
-        if node.split(' ')[0] not in ('losses', 'provenance')
+        if not is_loss_record(node) and node != 'provenance'
         for name, value in table.items()
     }
     label = f'{chr(ord("A") + number)}, {bag_display_name(folder)}'

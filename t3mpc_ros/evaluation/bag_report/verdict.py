@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
     Cause,
     cause_of,
 )
-from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving, find_frozen
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     format_pair,
@@ -144,7 +144,9 @@ def judge(
     if run.measured in run.untrusted:
         return _verdict(run, findings, '', judged=not lacking, damaged=True)
     if lacking:
-        said = _Finding(_without(run, lacking), 'Data missing: tracking cannot be judged')
+        said = _Finding(
+            _without(run, incidents, lacking), 'Data missing: tracking cannot be judged'
+        )
         if run.measured:
             findings += [*_interruptions(run, incidents), *_jumps(incidents)]
         return _verdict(run, [*findings, said], said.text, judged=False, damaged=damaged)
@@ -249,7 +251,7 @@ def _lacking(run: Run) -> tuple[str, ...]:
     return tuple(lacking)
 
 
-def _without(run: Run, lacking: Sequence[str]) -> str:
+def _without(run: Run, incidents: Incidents, lacking: Sequence[str]) -> str:
     """Return what the robot did, and why its tracking cannot be judged."""
     text = f'the bag holds no {" and no ".join(lacking)}, so tracking cannot be judged'
     motion = run.motion
@@ -257,7 +259,7 @@ def _without(run: Run, lacking: Sequence[str]) -> str:
         return text
     steps = np.diff(motion.time)
     steps = np.where(steps < 1.0, steps, 0.0)  # not over gaps
-    for start, end, _ in find_frozen(run):  # it did not move so far
+    for start, end, _ in incidents.frozen:  # it did not move so far
         steps = np.where((start < motion.time[1:]) & (motion.time[1:] <= end), 0.0, steps)
     way = float(np.sum(np.abs(motion['linear'][1:]) * steps))
     span = float(motion.time[-1] - motion.time[0])
