@@ -16,7 +16,7 @@
 ``python bench/zero_crossings.py``: a table in Markdown. For the controller of the node, nominal
 case, the settled error with shares of its power: of a wheel that is slower than ``SLOW`` or was so
 within ``RINGS``, of a wheel of which the other one was, and of all other samples. Then the same
-with coarser microsteps, and with a deadband of the commands (``wheel.deadband_velocity``).
+with coarser microsteps, and with deadbands of the commands (``wheel.deadband_velocity``).
 """
 
 import argparse
@@ -35,7 +35,7 @@ SLOW = 0.05
 """rad/s"""
 RINGS = 0.4
 """Time for which the rotor of a wheel rings after a zero crossing, s: three of its periods."""
-LEFT_OUT = 0.02, 0.05, 0.08
+LEFT_OUT = 0.02, 0.055, 0.08
 """Deadbands of the commands, rad/s."""
 MICROSTEPS = 16, 8
 """Per full step; the robot has 16."""

@@ -289,7 +289,7 @@ class Controller:
         self._period_ns = round(self._period * NANOSECONDS)
         self.actuation = VelocityActuation(
             parameters.speed_filter,
-            parameters.limits,
+            _command_limits(parameters),
             parameters.geometry,
             'velocity',
             self._period,
@@ -449,7 +449,7 @@ class Controller:
         self._tracker.configure(parameters.resolved())
         self.body.configure(parameters.body)
         self.pose_controller.parameters = parameters.pose
-        self.actuation.configure(parameters.limits)
+        self.actuation.configure(_command_limits(parameters))
         self._tracker.transition.limit = _command_limit(parameters)
         self._trajectory.set_jump(_least_jump(parameters.limits))
         if self.keep_out is not None:
@@ -1173,6 +1173,12 @@ def sample_reference(
 def hold_newest(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
     """Return the instant to interpolate at: the newest sample holds for ``hold_ns``."""
     return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
+
+
+def _command_limits(parameters: ControllerParameters) -> LimitParameters:
+    """Return the limits of the commands, without a deadband where no rotor oscillates."""
+    oscillates = any(parameters.command_shaper.delays)
+    return parameters.limits if oscillates else replace(parameters.limits, deadband=0.0)
 
 
 def _largest(limits: LimitParameters) -> BodyTwist:

@@ -71,6 +71,11 @@ class LinkFaults:
                 check_number(most, f'the largest {name}', least, MAX_DELAY, 's')
         except EntryError as error:
             raise ScriptError(str(error)) from None
+        if self.begin == 1.0 or self.lasting == 0.0:
+            raise ScriptError(
+                'begin must be less than 1 and lasting more than 0 s, or there are no faults: got '
+                f'begin {self.begin:g} and lasting {self.lasting:g} s'
+            )
         for name, least in (('swapped', 0), ('repeated', 1), ('kept', 1)):
             count = getattr(self, f'odometry_{name}')
             if isinstance(count, bool) or not isinstance(count, int) or count < least:

@@ -290,8 +290,8 @@ class RobotKind:
         raise ValueError(f'the controller of the node drives the twin alone: got {scenario}')
 
     def limits(self, scenario: Scenario) -> LimitParameters:
-        """Return the limits of a velocity command, equal in every run."""
-        return LimitParameters()
+        """Return the limits of a velocity command, equal in every run; a servo has no steps."""
+        return LimitParameters(deadband=0.0)
 
     def assumed_robot(self, scenario: Scenario) -> PaperRobotParameters:
         """Return the robot that methods assume, without factors, disturbance and noise."""

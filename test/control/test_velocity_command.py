@@ -43,6 +43,7 @@ WIDE = LimitParameters(
     linear_acceleration=50.0,
     angular_acceleration=500.0,
     wheel_acceleration=1e4,
+    deadband=0.0,
 )
 
 
@@ -161,7 +162,7 @@ def test_the_command_does_not_wind_up_behind_a_limit():
 
 def test_the_applied_acceleration_is_that_of_the_limited_command():
     rng = np.random.default_rng(5)
-    drive, servo = _drive(LimitParameters()), Servo()
+    drive, servo = _drive(LimitParameters(deadband=0.0)), Servo()
     stretch = T / (1.0 - math.exp(-T / 0.02))
     limited = 0
     for _ in range(500):
@@ -178,22 +179,50 @@ def test_the_applied_acceleration_is_that_of_the_limited_command():
     assert 100 < limited <= 500
 
 
-@pytest.mark.parametrize('acceleration', [1.0, 30.0])
-def test_a_deadband_leaves_out_slow_commands(acceleration):
-    """Neither in a sweep through zero nor at small limits, where a step is below the deadband."""
-    limits = LimitParameters(wheel_acceleration=acceleration, deadband=0.05)
-    drive, commands, wanted = _drive(limits), [], []
-    for k in range(2000):
-        goal = 0.2 * math.sin(0.01 * k) * np.array([1.0, -1.0])
+def _commands(limits, goals):
+    """Return the commands for wheel speeds that are wanted, shape (n, 2)."""
+    drive, commands = _drive(limits), []
+    for goal in goals:
         drive.observe(drive.command, T)
-        drive.send_speeds(goal)
+        drive.send_speeds(np.array(goal))
         commands.append(drive.command.copy())
-        wanted.append(goal)
-    commands, wanted = np.array(commands), np.array(wanted)
+    return np.array(commands)
+
+
+@pytest.mark.parametrize('acceleration', [1.0, 30.0])
+def test_slow_commands_are_left_out_within_the_limits(acceleration):
+    """A sweep through zero commands stop or the deadband; the step between them is limited too."""
+    limits = LimitParameters(wheel_acceleration=acceleration, deadband=0.05)
+    wanted = [0.2 * math.sin(0.01 * k) * np.array([1.0, -1.0]) for k in range(2000)]
+    commands = _commands(limits, wanted)
     slow = np.abs(wanted) < 0.05
-    assert np.isin(np.abs(commands[slow]), (0.0, 0.05)).all()
-    assert np.abs(commands - wanted).max() <= 0.025 + 1e-12
-    assert np.array_equal(commands[~slow], wanted[~slow])
+    assert np.abs(np.diff(commands, axis=0)).max() <= acceleration * T * (1 + 1e-9)
+    assert np.abs(commands - wanted)[~slow].max() <= (0.05 if acceleration < 5.0 else 0.0)
+    if acceleration == 30.0:
+        assert np.isin(np.abs(commands[slow]), (0.0, 0.05)).all()
+
+
+@pytest.mark.parametrize('speed', [0.002, 0.01, 0.019, 0.03, 0.05, -0.03])
+def test_a_creeping_wheel_has_the_right_mean_speed(speed):
+    """With stop or the nearer speed alone, 0.03 rad/s is driven with 0.055, 0.01 not at all."""
+    commands = _commands(LimitParameters(), [(speed, -speed)] * 6000)
+    behind = np.abs(np.cumsum(np.array([speed, -speed]) - commands, axis=0)) * T
+    assert behind.max() < 0.0206  # and one period
+    assert np.isin(commands, (0.0, 0.055, -0.055)).all()
+
+
+def test_a_wheel_that_is_to_stand_makes_up_for_nothing():
+    """What a creeping wheel is behind turns none whose reference is at rest, or is faster."""
+    for then in (0.0, 0.2):
+        commands = _commands(LimitParameters(), [(0.015, 0.03)] * 100 + [(then, then)] * 100)
+        assert np.ptp(commands[110:], axis=0).max() == 0.0
+        assert commands[-1] == pytest.approx(then)
+
+
+def test_a_deadband_is_at_most_a_tenth_of_the_largest_speed():
+    """A robot whose wheels may turn at 0.2 rad/s at most still moves slowly."""
+    commands = _commands(LimitParameters(wheel_speed=0.2), [(0.021, 0.021)] * 50)
+    assert commands[-1] == pytest.approx(0.021)
 
 
 def test_a_scaled_command_keeps_its_curvature_and_the_limits():

@@ -401,7 +401,8 @@ def test_a_bag_whose_parameters_changed_is_named_once():
 
 def _drive(kind='velocity'):
     estimate = SpeedFilterParameters(noise_variance=0.04)
-    return VelocityActuation(estimate, LimitParameters(), GEOMETRY, kind, 0.01)
+    limits = LimitParameters(deadband=0.0)  # a command tells the acceleration
+    return VelocityActuation(estimate, limits, GEOMETRY, kind, 0.01)
 
 
 def test_a_drive_with_a_set_command_goes_on_as_its_sender():

@@ -96,6 +96,7 @@ class Robot:
             'linear.x.max_acceleration': self.linear_acceleration,
             'angular.z.max_acceleration': self.angular_acceleration,
             'wheel.max_acceleration': self.wheel_acceleration,
+            'wheel.deadband_velocity': 0.0,  # it has no steps
         }
         return LimitParameters.from_dict({k: v for k, v in given.items() if v is not None})
 

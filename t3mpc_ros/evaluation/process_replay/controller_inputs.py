@@ -50,6 +50,9 @@ FIELDS = (*SPEEDS, *SCALAR_NAMES)
 """Compared fields, as columns."""
 SCALAR_RATE = 20.0
 """Rate of the scalars if the controller published none, or if its parameters are unknown, Hz."""
+BEFORE: Mapping[str, object] = {'wheel.deadband_velocity': 0.0}
+"""Parameters that bags of earlier versions lack, with the values at which they change nothing,
+where the default is another one."""
 STEP = int(Event.STEP)  # an enumeration is slower to compare
 
 
@@ -264,7 +267,8 @@ def _parameters(recording: BagReader, values: Mapping[str, object]) -> Controlle
     """Return the controller's own part of the node parameters."""
     names = _names()
     try:
-        return ControllerParameters.from_dict({k: v for k, v in values.items() if k in names})
+        own = {name: value for name, value in values.items() if name in names}
+        return ControllerParameters.from_dict({**BEFORE, **own})
     except ParameterError as error:
         raise ReplayError(
             f'{recording.folder}: the recorded settings cannot be used: {error}'

@@ -254,6 +254,8 @@ def test_wrong_use_is_one_sentence(call, text):
         ('LinkFaults', {'command_loss': 2.0}, 'command_loss must be a number from 0 to 1: got 2'),
         ('LinkFaults', {'odometry_loss': True}, 'odometry_loss must be a number from 0 to 1'),
         ('LinkFaults', {'begin': -0.1}, 'begin must be a number from 0 to 1: got -0.1'),
+        ('LinkFaults', {'begin': 1.0}, 'or there are no faults: got begin 1 and lasting inf s'),
+        ('LinkFaults', {'lasting': 0.0}, 'or there are no faults: got begin 0 and lasting 0 s'),
         ('LinkFaults', {'lasting': float('nan')}, 'lasting must be a number from 0 to inf s'),
         ('LinkFaults', {'odometry_delay': (0.2, 0.1)}, 'from 0.2 to 10 s: got 0.1'),
         ('LinkFaults', {'command_delay': 0.1}, 'command_delay must be a list: got 0.1'),
