@@ -47,7 +47,7 @@ from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
 from t3mpc_ros.evaluation.controller_adapters import NodeDriver, NodeMethod
-from t3mpc_ros.evaluation.experiment import ResultTable, map_jobs
+from t3mpc_ros.evaluation.experiment import ResultTable, Row, map_jobs
 from t3mpc_ros.evaluation.loop import ReportLink
 from t3mpc_ros.evaluation.method_table import (
     EXACT_MODEL,
@@ -58,7 +58,6 @@ from t3mpc_ros.evaluation.method_table import (
     SHAPED_IN_TIME,
     methods_for,
 )
-from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.result_output import replace_section
 from t3mpc_ros.evaluation.run_record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario

@@ -30,10 +30,9 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution, chaos
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison, compare
     from t3mpc_ros.evaluation.api.fuzzy_system import FuzzySystem, fuzzy
-    from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
     from t3mpc_ros.evaluation.api.own_reference import Waypoints
+    from t3mpc_ros.evaluation.api.own_robot import NoiseLaw, OdePlant, Robot, StateSpace
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
-    from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
     from t3mpc_ros.evaluation.api.script_inputs import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
@@ -75,10 +74,9 @@ _HOMES = {
     'evaluation.api.chaos_generator': ('ChaosSolution', 'chaos'),
     'evaluation.api.comparison_runs': ('Comparison', 'compare'),
     'evaluation.api.fuzzy_system': ('FuzzySystem', 'fuzzy'),
-    'evaluation.api.noise_law': ('NoiseLaw',),
     'evaluation.api.own_reference': ('Waypoints',),
+    'evaluation.api.own_robot': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
     'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
-    'evaluation.api.plants': ('OdePlant', 'Robot', 'StateSpace'),
     'evaluation.api.script_inputs': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),

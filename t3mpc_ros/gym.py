@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
+from t3mpc_ros.evaluation.api.own_robot import NoiseLaw
 from t3mpc_ros.evaluation.api.script_inputs import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import LinkFaults

@@ -474,7 +474,7 @@ def _run_replay(options: argparse.Namespace) -> None:
         **outcome.to_dict(),
     }
     if options.output:
-        from t3mpc_ros.evaluation.process_replay.replay_writer import write_replay
+        from t3mpc_ros.evaluation.process_replay.controller_replay import write_replay
 
         record['output'] = str(write_replay(inputs, again, options.output))
         text += f'\nwritten to {record["output"]}'

@@ -13,7 +13,8 @@
 # limitations under the License.
 """``t3mpc``: the command-line program; a subcommand is in the module of its name.
 
-``topic``, ``param``, ``call`` and ``stop`` share :mod:`~t3mpc_ros.cli.topic_param_call`.
+``topic``, ``param``, ``call`` and ``stop`` share :mod:`~t3mpc_ros.cli.topic_param_call`;
+``estimation`` and ``exponents`` are in :mod:`~t3mpc_ros.cli.paper`.
 """
 
 import argparse
@@ -32,8 +33,8 @@ PROGRAMS = {
 }
 """Subcommands with their own parser, in the module of the same name."""
 COMMANDS = (
-    'estimation', 'exponents', 'paper', 'compare', 'sweep', 'patrol', 'tune', 'train', 'faults',
-    'view', 'topic_param_call', 'compile',
+    'paper', 'compare', 'sweep', 'patrol', 'tune', 'train', 'faults', 'view', 'topic_param_call',
+    'compile',
 )  # fmt: skip
 """Modules of the other subcommands, in the order of the help, after ``demo``."""
 

@@ -94,9 +94,8 @@ def add_parser(commands: shared_options.Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the tables, write page, pictures and numbers, and return 0."""
-    from t3mpc_ros.evaluation.experiment import print_report
+    from t3mpc_ros.evaluation.experiment import ResultFile, print_report
     from t3mpc_ros.evaluation.figure_style import write_pictures
-    from t3mpc_ros.evaluation.result_file import ResultFile
     from t3mpc_ros.evaluation.result_output import strict_json
 
     if options.safety:

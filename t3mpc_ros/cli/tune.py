@@ -102,8 +102,11 @@ def run(options: argparse.Namespace) -> None:
 def _identify(options: argparse.Namespace) -> None:
     """Print the parameter file for the robot in the bag ``options.robot``."""
     from t3mpc_ros.evaluation.topic_roles import bag_display_name
-    from t3mpc_ros.evaluation.tuning.controller_for_drive import drive_file, drive_record
-    from t3mpc_ros.evaluation.tuning.drive_identification import identify_bag
+    from t3mpc_ros.evaluation.tuning.drive_identification import (
+        drive_file,
+        drive_record,
+        identify_bag,
+    )
 
     bag = Path(options.robot)
     if not bag.exists():

@@ -25,6 +25,10 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
+import fcntl
+from io import TextIOWrapper
+from itertools import starmap
+import json
 import multiprocessing
 from multiprocessing.context import SpawnContext, SpawnProcess
 import os
@@ -34,17 +38,101 @@ import signal
 import sys
 from typing import Any, Self, TypeVar
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
-from t3mpc_ros.evaluation.cluster_worker_modules import ModuleCarrier
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.result_file import ResultFile, Row
+from t3mpc_ros.evaluation.own_code import ModuleCarrier
 from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parent_process import end_with_parent
+
+Row = dict[str, Any]
+"""Plain data by name."""
+KEY = 'run'
+"""Name in a line of what tells its run from all others."""
+
+
+class ResultFile:
+    """Finished runs by key in a file of JSON lines; a context that one writer has at a time.
+
+    A line is written as a whole and flushed. Should a writer be killed within one, what is torn
+    is that line alone: reading skips it, and the next writer begins on a line of its own. With
+    ``fresh``, what the file holds is thrown away on first entry.
+    """
+
+    def __init__(self, path: Path, *, fresh: bool = False) -> None:
+        self.path = path
+        self._fresh = fresh
+        self.unreadable = 0
+        """Lines of the last reading that were torn or of another kind."""
+        self._stream: TextIOWrapper | None = None
+
+    def read(self) -> dict[str, Row]:
+        """Return every run the file holds, of whatever version; empty when there is no file."""
+        self.unreadable = 0
+        found: dict[str, Row] = {}
+        text = ''
+        with suppress(FileNotFoundError):
+            text = self.path.read_text(encoding='utf-8', errors='replace')
+        for line in text.split('\n'):
+            if not line.strip():
+                continue
+            try:
+                row = json.loads(line)
+                found[str(row.pop(KEY))] = row
+            except (ValueError, KeyError, TypeError, AttributeError):
+                self.unreadable += 1
+        return found
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Append a finished run."""
+        if self._stream is None:
+            raise RuntimeError('the file must be entered before runs are added')
+        self._stream.write(_line(key, row))
+        self._stream.flush()
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.is_dir():
+            raise RuntimeError(f'{self.path} must be a file for the runs: move that folder away')
+        stream = self.path.open('a+', encoding='utf-8', errors='replace')
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            stream.close()
+            raise RuntimeError(f'another process is writing to {self.path}') from None
+        if self._fresh:
+            stream.truncate(0)
+            self._fresh = False
+        content = self.path.read_bytes()
+        if content and not content.endswith(b'\n'):
+            stream.write('\n')
+            stream.flush()
+        self._stream = stream
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def remove(self, keys: Collection[str]) -> None:
+        """Remove runs from the file, and the file if it holds no others."""
+        with self:
+            others = {key: row for key, row in self.read().items() if key not in keys}
+            if others:
+                write_atomically(self.path, ''.join(starmap(_line, others.items())))
+            else:
+                self.path.unlink()
+
+
+def _line(key: str, row: Mapping[str, Any]) -> str:
+    return json.dumps({KEY: key, **row}, ensure_ascii=False) + '\n'
+
 
 GUARD = "a script that uses several processes must begin its work with: if __name__ == '__main__':"
 LOST_PROCESS = f'a worker process ended before its work was done; {GUARD}'

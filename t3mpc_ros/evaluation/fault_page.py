@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation.experiment import Row
 from t3mpc_ros.evaluation.fault_outcomes import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.figure_style import (
     COLOURS,
@@ -31,7 +32,6 @@ from t3mpc_ros.evaluation.figure_style import (
     new_figure,
     scale_by_size,
 )
-from t3mpc_ros.evaluation.result_file import Row
 
 BEGIN_MARK = '<!-- outcomes: written by `t3mpc faults`, do not edit by hand -->'
 END_MARK = '<!-- end of outcomes -->'

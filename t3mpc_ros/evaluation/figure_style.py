@@ -27,8 +27,8 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.html_page import thinned
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import World

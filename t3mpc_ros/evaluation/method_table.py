@@ -21,7 +21,6 @@ from typing import TypeVar
 
 from t3mpc_ros.control.input_shaper import InputShaperParameters
 from t3mpc_ros.evaluation.baselines import feedback_control
-from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
@@ -33,6 +32,7 @@ from t3mpc_ros.evaluation.baselines.feed_forward import (
     LmsBodyCorrection,
     LmsBodyCorrectionParameters,
 )
+from t3mpc_ros.evaluation.baselines.feedback_control import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
 from t3mpc_ros.evaluation.cases import NOMINAL

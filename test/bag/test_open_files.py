@@ -41,7 +41,7 @@ from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.bag.writer import SYNC_PERIOD_NS, BagWriter, read_attachment
-from t3mpc_ros.evaluation.result_file import ResultFile
+from t3mpc_ros.evaluation.experiment import ResultFile
 from t3mpc_ros.model_file import ModelError, load_model, save_model
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.serial_port import PortError, SerialPort

@@ -176,8 +176,8 @@ TUNE = {
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.tune_methods.tune_twin': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
-    'evaluation.tuning.controller_for_drive.drive_file': 'a: 1\n',
-    'evaluation.tuning.controller_for_drive.drive_record': {},
+    'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
+    'evaluation.tuning.drive_identification.drive_record': {},
 }
 MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
@@ -209,7 +209,7 @@ REPLAY = {
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
     'evaluation.process_replay.replay_comparison.compare': OUTCOME,
     'evaluation.process_replay.replay_comparison.compare_bags': OUTCOME,
-    'evaluation.process_replay.replay_writer.write_replay': 'there',
+    'evaluation.process_replay.controller_replay.write_replay': 'there',
     'evaluation.process_replay.replay_comparison.write_divergence_figure': None,
 }
 REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text, to_dict=dict)

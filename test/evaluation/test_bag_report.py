@@ -32,8 +32,8 @@ import yaml
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.incidents import smooth
-from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.motion_continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.recorded_run import BY_BODY, BY_WHEEL, Series, load_run

@@ -60,7 +60,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     statistics,
     tracking_error,
 )
-from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
+from t3mpc_ros.evaluation.html_page import MAX_POINTS, PageData, thinned
 from t3mpc_ros.evaluation.run_record import SETTLED, MeasuredRun, Record
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,

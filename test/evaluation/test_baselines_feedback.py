@@ -19,9 +19,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feedback_control import (
+    AdaptiveIntervalType2,
+    AdaptiveType1,
     ComputedTorque,
     DisturbanceRejection,
     ProportionalIntegral,

@@ -18,10 +18,9 @@ import sys
 
 import pytest
 
-from t3mpc_ros.evaluation import cluster_worker_modules
+from t3mpc_ros.evaluation import own_code
 from t3mpc_ros.evaluation.api.script_inputs import FileController
-from t3mpc_ros.evaluation.cluster_worker_modules import SourceText, own_sources, run_carried
-from t3mpc_ros.evaluation.run_key import source_digest
+from t3mpc_ros.evaluation.own_code import SourceText, own_sources, run_carried, source_digest
 from t3mpc_ros.script_error import ScriptError
 
 NAMES = ('carried', 'carried.law', 'carried_helper')
@@ -30,8 +29,8 @@ NAMES = ('carried', 'carried.law', 'carried_helper')
 @pytest.fixture
 def finder(monkeypatch):
     """A process that knows none of the modules, as a worker of another machine."""
-    found = cluster_worker_modules._Finder()
-    monkeypatch.setattr(cluster_worker_modules, 'FINDER', found)
+    found = own_code._Finder()
+    monkeypatch.setattr(own_code, 'FINDER', found)
     monkeypatch.setattr(sys, 'meta_path', [*sys.meta_path])
     yield found
     for name in NAMES:

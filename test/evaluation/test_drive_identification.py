@@ -27,10 +27,11 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.dead_time_estimator import IDENTIFIED_DEVIATION
 from t3mpc_ros.evaluation.topic_roles import ReportOptions
-from t3mpc_ros.evaluation.tuning.controller_for_drive import drive_file, fitting_parameters
 from t3mpc_ros.evaluation.tuning.drive_identification import (
     MAX_RELATIVE_DEVIATION,
     IdentificationError,
+    drive_file,
+    fitting_parameters,
     identify_bag,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels

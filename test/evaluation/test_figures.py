@@ -38,9 +38,8 @@ from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.method_table import FULL, methods_for
 from t3mpc_ros.evaluation.paper import paper_figures
-from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
-from t3mpc_ros.evaluation.paper.paper_study import STAGES, WITHOUT
-from t3mpc_ros.evaluation.paper.paper_tables import Results
+from t3mpc_ros.evaluation.paper.paper_figures import FigureRuns
+from t3mpc_ros.evaluation.paper.paper_study import STAGES, WITHOUT, Results
 from t3mpc_ros.evaluation.patrol import path_tracker_page, patrol_page
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import OURS as TRACKER
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (

@@ -37,9 +37,14 @@ from t3mpc_ros.evaluation.paper.claims import (
     all_claims,
     markdown,
 )
-from t3mpc_ros.evaluation.paper.figure_runs import explained, follows_claim, switches_claim
-from t3mpc_ros.evaluation.paper.paper_figures import floor_path, largest_switch
-from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables
+from t3mpc_ros.evaluation.paper.paper_figures import (
+    explained,
+    floor_path,
+    follows_claim,
+    largest_switch,
+    switches_claim,
+)
+from t3mpc_ros.evaluation.paper.paper_study import Results, all_tables
 from t3mpc_ros.evaluation.paper.reproduce import EXHIBITS, RUNS, counted, reproduce
 from t3mpc_ros.evaluation.result_output import finite
 from t3mpc_ros.evaluation.run_record import switch_times

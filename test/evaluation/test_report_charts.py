@@ -25,9 +25,13 @@ from support.report_run import COMMANDED, LINK, MOTIONS, NUMBERS, RUN, TIME, WHE
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report import report_page
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import Cause, cause_between
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
+    COUNTED,
+    Cause,
+    LinkMetrics,
+    cause_between,
+)
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, find_incidents
-from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     compute_metrics,
     estimation_target,
@@ -47,9 +51,9 @@ from t3mpc_ros.evaluation.bag_report.verdict import (
     judge,
     known_rmse,
 )
-from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.drive_response import ResponseFit
+from t3mpc_ros.evaluation.html_page import Plane
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 
 DEMO = Path(__file__).parents[2] / 'bench' / 'frozen' / 'demo.mcap'

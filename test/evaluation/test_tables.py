@@ -23,7 +23,7 @@ from support.records import record_of
 from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.paper.paper_tables import Results, estimation
+from t3mpc_ros.evaluation.paper.paper_study import Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table

@@ -27,13 +27,14 @@ from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models
-from t3mpc_ros.evaluation.training.cross_validation import mean_and_spread, spread_text
 from t3mpc_ros.evaluation.training.model_fit import (
     explained,
     fit_coefficients,
     fit_predictor,
+    mean_and_spread,
     periods,
     skills,
+    spread_text,
     stretches,
 )
 from t3mpc_ros.evaluation.training.train_models import fit_bags, training_data_of

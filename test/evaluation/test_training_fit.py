@@ -30,8 +30,8 @@ from t3mpc_ros.control.velocity_command import LimitParameters, VelocityActuatio
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models
-from t3mpc_ros.evaluation.training.cross_validation import blocks
 from t3mpc_ros.evaluation.training.model_fit import (
+    blocks,
     estimate_move_effect,
     explained,
     fit_coefficients,

@@ -29,12 +29,12 @@ import numpy as np
 from t3mpc_ros.bag.controller_input_journal import Journal
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
-from t3mpc_ros.evaluation.process_replay.controller_replay import output_row
-from t3mpc_ros.evaluation.process_replay.replay_writer import (
+from t3mpc_ros.evaluation.process_replay.controller_replay import (
     LATER,
     controller_bag,
     float_bytes,
     odometry_bytes,
+    output_row,
     revision_bytes,
     row_bytes,
     twist_bytes,

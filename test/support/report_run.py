@@ -18,7 +18,7 @@ import re
 import numpy as np
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.bag_report.link_metrics import LinkHistory
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkHistory
 from t3mpc_ros.evaluation.bag_report.recorded_run import (
     BY_WHEEL,
     SIGNAL_NAMES,

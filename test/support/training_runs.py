@@ -19,7 +19,7 @@ from support.bag_messages import START, serialised
 from support.golden_bags import ControllerBag, RecordedController
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import ControllerParameters
-from t3mpc_ros.evaluation.process_replay.replay_writer import TYPES as RECORDED
+from t3mpc_ros.evaluation.process_replay.controller_replay import TYPES as RECORDED
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds

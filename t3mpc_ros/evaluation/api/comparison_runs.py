@@ -24,8 +24,8 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import comparison
-from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
+from t3mpc_ros.evaluation.api.own_robot import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn, writable
 from t3mpc_ros.evaluation.api.script_inputs import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults

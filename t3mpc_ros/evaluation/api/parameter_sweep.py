@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api import comparison_runs, result_tables
-from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence, sentence
+from t3mpc_ros.evaluation.api.own_robot import NoiseLaw
 from t3mpc_ros.evaluation.api.script_inputs import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
@@ -35,16 +35,17 @@ from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval,
 from t3mpc_ros.evaluation.experiment import (
     Job,
     Report,
+    ResultFile,
     ResultTable,
+    Row,
     Run,
     measured_run,
     print_report,
     run_experiment,
 )
+from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.result_output import columns_of
-from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.parameters.version_and_commit import provenance

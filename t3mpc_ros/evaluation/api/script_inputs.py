@@ -35,10 +35,15 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.noise_law import NoiseLaw, gaussian_noise
 from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.api.own_reference import sampled
-from t3mpc_ros.evaluation.api.plants import OdePlant, Robot, StateSpace
+from t3mpc_ros.evaluation.api.own_robot import (
+    NoiseLaw,
+    OdePlant,
+    Robot,
+    StateSpace,
+    gaussian_noise,
+)
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.noise_law import NoiseLaw
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
+from t3mpc_ros.evaluation.api.own_robot import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn
 from t3mpc_ros.evaluation.api.script_inputs import as_controllers, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults

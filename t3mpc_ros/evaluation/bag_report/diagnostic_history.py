@@ -11,18 +11,121 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Diagnostics over time: conditions of every node, and the histories of radio links."""
+"""Diagnostics over time: conditions of every node, radio links, changes of the map."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
-from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTERS, LINK_KEYS, SHARES, LinkHistory
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
+
+SHARES = ('lost_share', 'round_trip_median_ms', 'round_trip_p99_ms', 'telemetry_age_s')
+"""Keys of gauges, see ``radio_bridge``."""
+COUNTED = {
+    'cycles': 'cycles',
+    'cycles_lost': 'cycles lost',
+    'robot_resets': 'resets of the robot board',
+    'dongle_resets': 'resets of the dongle',
+    'port_failures': 'port failures',
+    'sessions': 'sessions begun after the first report',
+    'crc_errors': 'wrong checksums',
+    'frame_errors': 'malformed frames',
+}
+"""Counters that a report shows, with their names."""
+COUNTERS = (*COUNTED, 'commands', 'commands_refused')
+"""Keys of counters, which only grow."""
+LINK_KEYS = ('cycles', 'cycles_lost', 'lost_share', 'round_trip_median_ms', 'round_trip_p99_ms')
+"""A status with at least two of these keys describes a link."""
+
+
+@dataclass(frozen=True)
+class LinkHistory:
+    """Metrics of one link over time."""
+
+    name: str
+    time: Array
+    """Receive time, s."""
+    values: Mapping[str, Array]
+    """Arrays by key, NaN where a value is missing; keys of :data:`SHARES` and :data:`COUNTERS`."""
+
+    def answered(self) -> Array:
+        """Return the share of answered cycles since the previous report, shape (n,)."""
+        cycles, lost = self.values.get('cycles'), self.values.get('cycles_lost')
+        if cycles is None or lost is None:
+            share = self.values.get('lost_share')
+            return np.full(self.time.size, math.nan) if share is None else 1.0 - share
+        made, failed = (np.diff(table, prepend=math.nan) for table in (cycles, lost))
+        with np.errstate(invalid='ignore', divide='ignore'):
+            known = (made > 0.0) & (failed >= 0.0) & (np.diff(self._starts(), prepend=0) == 0)
+            return np.where(known, 1.0 - failed / made, math.nan)
+
+    def grown(self, key: str) -> float:
+        """Return the increase of a counter in the recording, over restarts; NaN if unknown."""
+        table = self.values.get(key)
+        if table is None or not np.isfinite(table).any():
+            return math.nan
+        rows = np.flatnonzero(np.isfinite(table))
+        known = table[rows]
+        restarted = np.diff(self._starts()[rows]) > 0
+        return float(np.where(restarted, known[1:], np.diff(known)).sum())
+
+    def _starts(self) -> NDArray[np.intp]:
+        """Return how often the bridge was started anew up to each report, shape (n,).
+
+        All its counters begin at zero then. The one that falls tells it of those that do not.
+        """
+        fell = np.zeros(self.time.size, dtype=bool)
+        for table in (self.values[key] for key in COUNTERS if key in self.values):
+            rows = np.flatnonzero(np.isfinite(table))
+            fell[rows[1:]] |= np.diff(table[rows]) < 0.0
+        return np.cumsum(fell)
+
+
+@dataclass(frozen=True)
+class LinkMetrics:
+    """Quality of a link over a recording; NaN where it is unknown."""
+
+    counts: Mapping[str, float]
+    """Increase of each of :data:`COUNTED` over the recording."""
+    answered: float
+    """Share of the cycles."""
+    round_trip: float
+    """Median over the reports of the median round trip, s."""
+    round_trip_99: float
+    """Largest reported 99th percentile, s."""
+    oldest: float
+    """Largest reported age of the last measurement, s."""
+
+
+def link_metrics(link: LinkHistory) -> LinkMetrics:
+    """Return the summary of a link."""
+    counts = {key: link.grown(key) for key in COUNTED}
+    answered = _over(np.nanmean, link.answered())
+    if counts['cycles'] > 0.0 and math.isfinite(counts['cycles_lost']):
+        answered = 1.0 - counts['cycles_lost'] / counts['cycles']
+    empty = np.full(1, math.nan)
+    return LinkMetrics(
+        counts,
+        answered,
+        1e-3 * _over(np.nanmedian, link.values.get('round_trip_median_ms', empty)),
+        1e-3 * _over(np.nanmax, link.values.get('round_trip_p99_ms', empty)),
+        _over(np.nanmax, link.values.get('telemetry_age_s', empty)),
+    )
+
+
+def _over(measure: Callable[[Array], Any], values: Array) -> float:
+    return float(measure(values)) if np.isfinite(values).any() else math.nan
+
+
+# -- conditions -----------------------------------------------------------------------------------
+
 
 _LEVELS = {0: 'ok', 1: 'warning', 2: 'error', 3: 'stale'}
 STANDSTILL = 'standstill'
@@ -284,3 +387,57 @@ def _was_over(event: DiagnosticEvent, changes: Sequence[DiagnosticEvent], end: f
     later = (each for each in changes if each[2] == event[2] and each[0] > event[0])
     following = next(later, None)
     return following is not None and following[0] < end - OVER and cause_of(following) is None
+
+
+# -- changes of the map ---------------------------------------------------------------------------
+
+
+MAP_CHANGES = 'map_changes'
+CHANGE_NUMBERS = ('x_m', 'y_m', 'size_m', 'confidence', 'first_seen_s', 'found_s', 'last_seen_s')
+
+
+class RecordedChange(NamedTuple):
+    """What contradicted the map, as last published."""
+
+    kind: str
+    state: str
+    """there, gone or withdrawn"""
+    x: float
+    """m"""
+    y: float
+    """m"""
+    size: float
+    """m"""
+    confidence: float
+    found: float
+    """Time of the first message with it, s."""
+    seen_before: float
+    """Time for which it was seen before that, s."""
+    seen_for: float
+    """Time from the first to the last sight, s."""
+
+
+def read_map_changes(
+    recording: BagReader, namespace: str, local: Callable[[Array], Array]
+) -> tuple[RecordedChange, ...]:
+    """Return the changes in a bag; ``local`` maps receive times to times of the run, s."""
+    topic = recording.topics.get(f'{namespace}/{MAP_CHANGES}')
+    if topic is None or not topic.type_name.endswith('DiagnosticArray'):
+        return ()
+    found: dict[str, RecordedChange] = {}
+    for received, message in recording.messages(topic.name):
+        for status in message.status:
+            values = {each.key: each.value for each in status.values}
+            before = found.get(status.name)
+            with suppress(KeyError, ValueError):  # of another publisher
+                x, y, size, confidence, first, event, last = (
+                    float(values[key]) for key in CHANGE_NUMBERS
+                )
+                gone = 'withdrawn' if values.get('withdrawn') == 'True' else 'gone'
+                found[status.name] = RecordedChange(
+                    values['kind'], 'there' if values['present'] == 'True' else gone,
+                    x, y, size, confidence,
+                    before.found if before else float(local(np.array([received]))[0]),
+                    event - first, last - first,
+                )  # fmt: skip
+    return tuple(found.values())

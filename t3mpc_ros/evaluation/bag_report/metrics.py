@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from t3mpc_ros.evaluation.bag_report import tracking_errors
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
-from t3mpc_ros.evaluation.bag_report.link_metrics import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
 from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge

@@ -11,18 +11,18 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Section of a report on where the robot was: coverage, evenness, predictability."""
+"""Sections of a report on a patrol: where the robot was, and what contradicts its map."""
 
 from collections.abc import Iterator
 import math
 
 import numpy as np
 
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import RecordedChange
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import on_reference_frame
-from t3mpc_ros.evaluation.charts import Chart, Line
-from t3mpc_ros.evaluation.html_page import Block, Heading, Paragraph
+from t3mpc_ros.evaluation.html_page import Block, Chart, Heading, Line, Paragraph
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     SHARES,
     SHORTEST,
@@ -54,7 +54,7 @@ def followed_reference(run: Run) -> Series | None:
 
 
 def patrol_blocks(run: Run) -> Iterator[Block]:
-    """Yield the section; nothing for a robot that hardly left its place."""
+    """Yield the section on coverage; nothing for a robot that hardly left its place."""
     motion = run.motion
     if motion is None or len(motion) < 2:
         return
@@ -133,3 +133,26 @@ def _grid(run: Run, x: Array, y: Array) -> tuple[CoverageGrid, str]:
     low = float(x.min()) - 1e-6, float(y.min()) - 1e-6
     high = float(x.max()) + 1e-6, float(y.max()) + 1e-6
     return CoverageGrid(low, high), 'the bounding box of the path'
+
+
+def map_change_blocks(changes: tuple[RecordedChange, ...]) -> Iterator[Block]:
+    """Yield the section on what contradicts the map; nothing without changes."""
+    if not changes:
+        return
+    yield Heading('What contradicts the map')
+    head = ['found / s', 'kind', 'place', 'size', 'confidence', 'seen before', 'seen for', 'state']
+    rows = [
+        [
+            f'{each.found:.1f}', each.kind, f'x {each.x:.2f} m, y {each.y:.2f} m',
+            f'{each.size:.2f} m', f'{each.confidence:.2f}', f'{each.seen_before:.1f} s',
+            f'{each.seen_for:.1f} s', each.state,
+        ]
+        for each in changes
+    ]  # fmt: skip
+    yield Table('', head, rows, text=4)
+    yield Paragraph(
+        'New: a thing that the map lacks; missing: one that is not where the map has it; moving: '
+        'it was seen, and then that it was gone. The place is the middle of what was seen of it. '
+        'Withdrawn: the robot was lost, and had not been where it took itself to be.',
+        'quiet',
+    )

@@ -26,8 +26,7 @@ from t3mpc_ros.bag.errors import DataError
 from t3mpc_ros.bag.message_losses import lost_spans
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report import diagnostic_history, link_metrics
-from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
+from t3mpc_ros.evaluation.bag_report import diagnostic_history
 from t3mpc_ros.evaluation.bag_report.motion_continuity import (
     DISPLACED,
     DISPLACED_TURN,
@@ -185,7 +184,7 @@ class Run:
     """From diagnostics: first time, level, node, text."""
     changes: tuple[diagnostic_history.DiagnosticEvent, ...]
     """Likewise, each time that a node got worse."""
-    links: tuple[link_metrics.LinkHistory, ...]
+    links: tuple[diagnostic_history.LinkHistory, ...]
     oddities: tuple[str, ...]
     """Sentences on what is unusual in the bag, and what was done about it."""
     remarks: tuple[str, ...]
@@ -204,7 +203,7 @@ class Run:
     """Name of the simulated world; empty if unknown."""
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
-    map_changes: tuple[RecordedChange, ...] = ()
+    map_changes: tuple[diagnostic_history.RecordedChange, ...] = ()
     behind: float = 0.0
     """By how much the stamps of the odometry are behind those of the reference, if both are of
     different clocks, s; else 0."""
@@ -303,7 +302,9 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         damage=damage,
         untrusted=tuple(untrusted),
         world=records.get('sim_robot', {}).get('world', ''),
-        map_changes=read_map_changes(recording, choice.namespaces[0], clock.local),
+        map_changes=diagnostic_history.read_map_changes(
+            recording, choice.namespaces[0], clock.local
+        ),
         behind=_behind(raw, motions),
         publishers=_publishers(recording, topics, motions, complaints),
         other_clock=clock.other,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import tracking_errors
-from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,
@@ -35,8 +35,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
-from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
+from t3mpc_ros.evaluation.html_page import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array

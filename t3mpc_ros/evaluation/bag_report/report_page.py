@@ -24,20 +24,18 @@ from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.message_losses import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report import incidents
-from t3mpc_ros.evaluation.bag_report.link_metrics import COUNTED, LinkMetrics
-from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,
     UNMEASURED,
     ReportMetrics,
     compute_metrics,
 )
-from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
+from t3mpc_ros.evaluation.bag_report.patrol_section import map_change_blocks, patrol_blocks
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, load_run
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS, Section, undetermined
 from t3mpc_ros.evaluation.bag_report.tracking_errors import errors_of
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
-from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.html_page import (
     Block,
@@ -48,6 +46,7 @@ from t3mpc_ros.evaluation.html_page import (
     Items,
     Paragraph,
     Tiles,
+    Timeline,
     VerdictBox,
     html_page,
 )

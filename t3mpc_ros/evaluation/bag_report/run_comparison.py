@@ -41,15 +41,17 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     path_distance,
     tracking_error,
 )
-from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, rms
 from t3mpc_ros.evaluation.html_page import (
     Block,
+    Chart,
     Contents,
+    Curve,
     Group,
     Heading,
     Items,
     Paragraph,
+    Plane,
     VerdictBox,
     html_page,
 )

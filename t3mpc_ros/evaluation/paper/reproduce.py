@@ -24,10 +24,10 @@ from t3mpc_ros.evaluation import fuzzy_estimation_error, html_page, report_table
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.figure_style import write_pictures
 from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
-from t3mpc_ros.evaluation.paper import figure_runs, paper_figures, paper_study
+from t3mpc_ros.evaluation.own_code import source_digest
+from t3mpc_ros.evaluation.paper import paper_figures, paper_study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
-from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
-from t3mpc_ros.evaluation.run_key import source_digest
+from t3mpc_ros.evaluation.paper.paper_study import Results, all_tables, csv_columns
 from t3mpc_ros.parameters.version_and_commit import machine, provenance
 from t3mpc_ros.version import VERSION
 
@@ -59,7 +59,7 @@ def reproduce(
     extent = paper_study.chosen_extent(quick=quick, seeds=seeds)
     results = Results(run_study(extent, output, workers, fresh=fresh, report=report))
     write('  runs for the figures')
-    showcase = figure_runs.simulate_figure_runs(extent, results, workers)
+    showcase = paper_figures.simulate_figure_runs(extent, results, workers)
     write('  estimation without a controller (86)')
     alone = estimation_seeds or tuple(range(1, 3 if quick else 21))
     variances = (0.0, 0.04) if quick else fuzzy_estimation_error.VARIANCES
@@ -152,7 +152,7 @@ class ExhibitData:
     """What exhibits are made of."""
 
     results: Results
-    showcase: figure_runs.FigureRuns
+    showcase: paper_figures.FigureRuns
     claims: Sequence[Claim]
     tables: Mapping[str, Sequence[report_table.Table]]
 

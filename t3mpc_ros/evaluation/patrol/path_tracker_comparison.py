@@ -31,15 +31,14 @@ import numpy as np
 
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
+from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,
 )
-from t3mpc_ros.evaluation.result_file import Row
-from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path

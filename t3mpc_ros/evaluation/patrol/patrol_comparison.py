@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
+from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
@@ -40,8 +41,6 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     patrol_metrics,
     visits,
 )
-from t3mpc_ros.evaluation.result_file import Row
-from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

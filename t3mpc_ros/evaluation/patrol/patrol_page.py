@@ -29,6 +29,7 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     mean,
     paired,
 )
+from t3mpc_ros.evaluation.experiment import Row
 from t3mpc_ros.evaluation.figure_style import TitledDrawing, draw_world, new_figure, whisker
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     BOXES,
@@ -40,7 +41,6 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.simulation.world import World
 from t3mpc_ros.version import VERSION
 

@@ -44,7 +44,7 @@ from t3mpc_ros.evaluation.scenario import (
     held_out,
 )
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
-from t3mpc_ros.evaluation.training.cross_validation import (
+from t3mpc_ros.evaluation.training.model_fit import (
     FITTED,
     LOOP,
     MIDDLE,
@@ -52,13 +52,11 @@ from t3mpc_ros.evaluation.training.cross_validation import (
     Fold,
     blocks,
     cross_validate,
+    fit_coefficients,
+    fit_predictor,
     fold_table,
     mean_and_spread,
     pair,
-)
-from t3mpc_ros.evaluation.training.model_fit import (
-    fit_coefficients,
-    fit_predictor,
     periods,
     skills,
     stretches,

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import cma
 import numpy as np
 
-from t3mpc_ros.evaluation.result_file import ResultFile
+from t3mpc_ros.evaluation.experiment import ResultFile
 from t3mpc_ros.evaluation.tuning.search_space import SearchSpace, Values
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters

@@ -18,7 +18,7 @@ The model, and the fit of dead time and lag, are those of
 over the period before, whichever fits better.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control import dead_time_estimator
-from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.control.controller import WHEELS, ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series, load_run
 from t3mpc_ros.evaluation.drive_response import (
     DEAD_TIME,
@@ -41,6 +41,7 @@ from t3mpc_ros.evaluation.drive_response import (
 from t3mpc_ros.evaluation.topic_roles import COMMAND, KINDS, ODOMETRY, ReportOptions
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.parameters.yaml_file import parameter_file
 from t3mpc_ros.robot.calibration import Estimate
 
 MIN_DURATION = 10.0
@@ -211,3 +212,66 @@ def _white_variance(errors: Array) -> Estimate:
     value = float((second**2).mean()) / 6.0
     relative = math.sqrt(2.0 * (1.0 + 8.0 / 9.0 + 1.0 / 18.0) / second.size)
     return Estimate(value, math.hypot(relative * value, dead_time_estimator.MIN_NOISE_VARIANCE))
+
+
+# -- parameter file -------------------------------------------------------------------------------
+
+
+def fitting_parameters(
+    drive: IdentifiedDrive, composition: str, slower: float = 0.0
+) -> ControllerParameters:
+    """Return the parameters for a drive with a lag ``slower`` by some s; the gain by the rule."""
+    parameters = StepperControllerParameters().with_values(
+        {
+            'rate': drive.rate,
+            'wheel_radius': drive.geometry.wheel_radius,
+            'wheel_separation': drive.geometry.wheel_separation,
+            'composition': composition,
+            'mean_speeds': drive.mean_speeds,
+            'speed_filter.lag': drive.lag.value + slower,
+            'speed_filter.dead_time': drive.dead_time.value,
+            'speed_filter.noise_variance': drive.noise_variance.value,
+            'law.gain': 0.0,
+        }
+    )
+    return parameters.resolved()
+
+
+def drive_record(drive: IdentifiedDrive, composition: str) -> dict[str, object]:
+    """Return the drive, with standard deviations, and the parameters that fit it as plain data."""
+    return {'drive': asdict(drive), 'parameters': fitting_parameters(drive, composition).to_dict()}
+
+
+def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
+    """Return the parameter file (YAML) of the controller for a drive; ``source`` names the bag."""
+    values = fitting_parameters(drive, composition).to_dict()
+    slower = fitting_parameters(drive, composition, drive.lag.uncertainty).to_dict()
+
+    def by_lag(name: str, unit: str) -> str:
+        change = abs(float(str(slower[name])) - float(str(values[name])))
+        return f'by the lag; standard deviation {change:.2g} {unit}'
+
+    kind = 'means over the period before the stamp' if drive.mean_speeds else 'at the stamp'
+    comments = {
+        'rate': 'of the odometry',
+        'wheel_radius': '',
+        'wheel_separation': '',
+        'composition': '',
+        'mean_speeds': f'measured speeds are {kind}',
+        'speed_filter.lag': f'standard deviation {drive.lag.uncertainty:.2g} s',
+        'speed_filter.dead_time': f'standard deviation {drive.dead_time.uncertainty:.2g} s',
+        'speed_filter.noise_variance': 'standard deviation '
+        f'{drive.noise_variance.uncertainty:.2g} (rad/s)²',
+        'law.gain': by_lag('law.gain', '1/s'),
+        'law.smoothing': by_lag('law.smoothing', 'rad/s'),
+    }
+    rounded = {
+        name: float(f'{value:.5g}') if isinstance(value := values[name], float) else value
+        for name in comments
+    }
+    title = (
+        f'Drive identified from {source}: {drive.duration:.1f} s, '
+        f'{100 * drive.explained:.1f} % of the wheel speeds explained.'
+    )
+    title = '\n# '.join([title, *drive.oddities])
+    return parameter_file(title, {'/**/controller': rounded}, comments)

@@ -11,13 +11,13 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Robots and plants of a script."""
+"""Robots, plants and noise of a script."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.api.own_reference import numbers
-from t3mpc_ros.geometry.types import Array, read_only
+from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only
 from t3mpc_ros.mpc.pretraining import matrix_exponential
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
@@ -303,3 +303,65 @@ class OwnSimulation:
     def measure(self, dt: float) -> tuple[float, float]:
         """Return the wheel speeds, rad/s: the noise is added outside."""
         return self.wheels
+
+
+@dataclass(frozen=True)
+class NoiseLaw:
+    """Noise of the measured wheel speeds by a law of one's own.
+
+    Parameters
+    ----------
+    draw
+        Gets a generator (:class:`numpy.random.Generator`), the time (s) and the true wheel speeds
+        (rad/s, shape (2,)); returns what is added to them, shape (2,).
+    variance
+        What the estimator of every method assumes, (rad/s)².
+    """
+
+    draw: Callable[[np.random.Generator, float, Array], Any]
+    variance: float
+
+    @one_sentence
+    def __post_init__(self) -> None:
+        if not callable(self.draw):
+            raise ScriptError(
+                f'draw must be a function of generator, time and speeds: got {self.draw!r}'
+            )
+        if not (isinstance(self.variance, int | float) and 0.0 <= self.variance <= 100.0):
+            raise ScriptError(f'variance must be from 0 to 100 (rad/s)²: got {self.variance!r}')
+
+    def simulation(self, seed: int) -> 'LawNoise':
+        """Return the noise of a run."""
+        return LawNoise(self.draw, np.random.default_rng((seed, 5)))
+
+
+class LawNoise(NamedTuple):
+    """Noise of a run, drawn by a law."""
+
+    draw: Callable[[np.random.Generator, float, Array], Any]
+    generator: np.random.Generator
+
+    def measure(self, wheels: WheelSpeeds, time: float) -> WheelSpeeds:
+        """Return wheel speeds (rad/s) with noise at a time (s)."""
+        time, true = round(time, 9), np.array(wheels)  # a law may compare the time
+        try:
+            drawn = self.draw(self.generator, time, read_only(true))
+            noise = np.asarray(drawn, dtype=np.float64)
+        except Exception as error:
+            raise ScriptError(
+                f'the noise law raised {described(error)}, at {time:.2f} s'
+            ) from None
+        if noise.shape != (2,) or not np.isfinite(noise).all():
+            raise ScriptError(
+                f'the noise law must return two finite numbers: got {noise} at {time:.2f} s'
+            )
+        return WheelSpeeds(*(true + noise).tolist())
+
+
+def gaussian_noise(variance: float) -> NoiseLaw:
+    """Return the law of white noise with a variance in (rad/s)²."""
+    return NoiseLaw(partial(_white_noise, math.sqrt(variance)), variance)
+
+
+def _white_noise(deviation: float, generator: np.random.Generator, *_: object) -> Array:
+    return deviation * generator.standard_normal(2)
