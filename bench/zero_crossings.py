@@ -27,7 +27,7 @@ import numpy as np
 from t3mpc_ros.evaluation.experiment import map_jobs
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method_table import FULL, methods_for
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import RATE, START, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 

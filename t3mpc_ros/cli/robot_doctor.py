@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -135,10 +135,10 @@ def _write(checks: Sequence[Check], path: Path) -> None:
         'open': f'nothing failed; poor: {counts[POOR]}, skipped: {counts[SKIPPED]}',
         'good': 'all checks passed',
     }[kind]
-    rows: list[list[str | report_table.Mark]] = [
+    rows: list[list[str | result_output.Mark]] = [
         [
             check.name,
-            report_table.Mark(check.verdict, _MARKS[check.verdict]),
+            result_output.Mark(check.verdict, _MARKS[check.verdict]),
             str(check.step or ''),
             check.value,
             check.remedy if check.verdict in (POOR, FAIL) else '',
@@ -148,7 +148,7 @@ def _write(checks: Sequence[Check], path: Path) -> None:
     blocks: list[html_page.Block] = [
         html_page.VerdictBox(headline, failed, kind),
         html_page.Tiles([(str(count), verdict) for verdict, count in counts.items()]),
-        report_table.Table(
+        result_output.Table(
             '', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True
         ),
     ]

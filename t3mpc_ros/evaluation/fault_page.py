@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.evaluation.experiment import Row
 from t3mpc_ros.evaluation.fault_outcomes import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.figure_style import (
@@ -84,8 +84,8 @@ def hidden(row: Row) -> bool:
 
 def table_row(row: Row) -> tuple[str, ...]:
     """Return the cells of a table."""
-    after = report_table.EMPTY_CELL if row['after'] is None else f'{row["after"]:.2f}'
-    undetected = ', '.join(row['undetected']) or report_table.EMPTY_CELL
+    after = result_output.EMPTY_CELL if row['after'] is None else f'{row["after"]:.2f}'
+    undetected = ', '.join(row['undetected']) or result_output.EMPTY_CELL
     if hidden(row):
         undetected = (UNREPORTED if row['ranges'] else UNDETECTED) + undetected
     return (
@@ -93,7 +93,7 @@ def table_row(row: Row) -> tuple[str, ...]:
         outcome_sentence(row),
         f'{row["before"]:.2f}, {row["during"]:.2f}, {after}',
         f'{_place(*row["odometry_before"])}; {_place(*row["odometry_after"])}',
-        ', '.join(filter(None, [*row['detected'], row['ranges']])) or report_table.EMPTY_CELL,
+        ', '.join(filter(None, [*row['detected'], row['ranges']])) or result_output.EMPTY_CELL,
         undetected,
     )
 
@@ -108,7 +108,7 @@ def by_course(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
 def markdown_tables(rows: Sequence[Row]) -> str:
     """Return a table for each course, one row for each outcome."""
     tables = [
-        (title, report_table.Table('', TABLE_HEAD, [*map(table_row, chosen)]))
+        (title, result_output.Table('', TABLE_HEAD, [*map(table_row, chosen)]))
         for title, chosen in by_course(rows)
     ]
     return '\n'.join(f'### {title}\n\n{table.markdown()}\n' for title, table in tables)
@@ -176,7 +176,7 @@ def page(rows: Sequence[Row]) -> str:
             blocks.append(html_page.Contents())
         cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]
                  for row in chosen]  # fmt: skip
-        blocks.append(report_table.Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
+        blocks.append(result_output.Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
     return html_page.html_page('Fault study of the closed loop', blocks)
 
 

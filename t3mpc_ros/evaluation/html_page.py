@@ -26,8 +26,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.report_table import Mark, Table
-from t3mpc_ros.evaluation.result_output import finite
+from t3mpc_ros.evaluation.result_output import Mark, Table, finite
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.page.assets import page_file
 

@@ -11,10 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Results as CSV, JSON and numbers in text; progress line, and sections of pages."""
+"""Results as tables (text, Markdown, HTML, LaTeX), CSV and JSON; numbers in text; progress."""
 
 from collections.abc import Mapping, Sequence
 import csv
+from dataclasses import dataclass, replace
+import html
 from importlib import import_module
 from importlib.util import find_spec
 import io
@@ -22,17 +24,155 @@ import json
 import math
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
+from t3mpc_ros.parameters.table import find_names
 
 if TYPE_CHECKING:
     from tqdm import tqdm
-from t3mpc_ros.evaluation.report_table import EMPTY_CELL
+
+EMPTY_CELL = '–'
+
+
+class Mark(NamedTuple):
+    """A coloured word; its kind is ``yes``, ``no``, ``open`` or ``apart``."""
+
+    text: str
+    kind: str
+
+
+def verdict_mark(verdict: str) -> Mark:
+    """Return a verdict of any page in its colour: ``apart`` where it is left open."""
+    kinds = {'not measured': 'open', 'inconclusive': 'apart', 'not comparable': 'apart'}
+    kinds |= dict.fromkeys(('held', 'holds', 'ours is better'), 'yes')
+    return Mark(verdict, kinds.get(verdict, 'no'))
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of words; its first column names the rows."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str | Mark]]
+    bold: tuple[str, ...] = ()
+    """Names of highlighted rows."""
+    text: int = 1
+    """How many of the first columns are text; the others are numbers."""
+    wrap: bool = False
+    """Whether long cells of a page have several lines."""
+    notes: Sequence[str] = ()
+    """Paragraphs below the table: why a cell has no number, how a verdict is made."""
+
+    def with_columns(self, names: Sequence[str]) -> 'Table':
+        """Return the table with its first column and some others, by their headings.
+
+        A heading may lack its unit; one that is named twice takes the next column of this heading.
+        """
+        short = [head.partition(',')[0] for head in self.head]
+        chosen = [0]
+        for name in names:
+            full = name if name in self.head else find_names('column', [name], short)[0]
+            known = self.head if full in self.head else short
+            chosen += [k for k, head in enumerate(known) if head == full and k not in chosen][:1]
+        rows = [[row[k] for k in chosen] for row in self.rows]
+        text = sum(k < self.text for k in chosen)
+        return replace(self, head=[self.head[k] for k in chosen], rows=rows, text=text)
+
+    def markdown(self) -> str:
+        """Return the table with its title in Markdown."""
+        lines = [f'**{self.title}**', ''] if self.title else []
+        lines += [_line(self.head), '|---' * len(self.head) + '|']
+        for row in self.rows:
+            name, *cells = _words(row)
+            lines.append(_line([f'**{name}**' if name in self.bold else name, *cells]))
+        for note in self.notes:
+            lines += ['', note]
+        return '\n'.join(lines)
+
+    def html(self) -> str:
+        """Return the table as HTML without a style of its own, as for a cell of a notebook."""
+        title = f'<caption>{html.escape(self.title)}</caption>' if self.title else ''
+        lines = [_html_row('th', self.head, self.text)]
+        for row in self.rows:
+            lines.append(_html_row('td', _words(row), self.text, row[0] in self.bold))
+        notes = ''.join(f'<p><small>{html.escape(note)}</small></p>' for note in self.notes)
+        return f'<table>{title}' + ''.join(lines) + f'</table>{notes}'
+
+    def latex(self, label: str = '') -> str:
+        """Return the table as a LaTeX float with the rules of the package ``booktabs``."""
+        places = 'l' * self.text + 'r' * (len(self.head) - self.text)
+        lines = [r'\begin{table}', r'  \centering']
+        if self.title:
+            lines.append(rf'  \caption{{{_latex(self.title)}}}')
+        if label:
+            lines.append(rf'  \label{{{label}}}')
+        lines += [rf'  \begin{{tabular}}{{{places}}}', r'    \toprule', _latex_row(self.head)]
+        lines.append(r'    \midrule')
+        lines += [_latex_row(_words(row), row[0] in self.bold) for row in self.rows]
+        lines += [r'    \bottomrule', r'  \end{tabular}']
+        lines += [rf'  \par\smallskip{{\footnotesize {_latex(note)}\par}}' for note in self.notes]
+        lines.append(r'\end{table}')
+        return '\n'.join(lines) + '\n'
+
+
+def _words(row: Sequence[str | Mark]) -> list[str]:
+    return [each if isinstance(each, str) else each.text for each in row]
+
+
+def _html_row(kind: str, cells: Sequence[str], text: int, bold: bool = False) -> str:
+    shown = [html.escape(cell) for cell in cells]
+    if bold:
+        shown[0] = f'<b>{shown[0]}</b>'
+    ways = ['left' if i < text else 'right' for i in range(len(shown))]
+    pairs = zip(ways, shown, strict=True)
+    return (
+        f'<tr>{"".join(f"<{kind} style=text-align:{way}>{x}</{kind}>" for way, x in pairs)}</tr>'
+    )
+
+
+LATEX = {
+    '\\': r'\textbackslash{}',
+    **{sign: f'\\{sign}' for sign in '&%$#_{}'},
+    '~': r'\textasciitilde{}',
+    '^': r'\textasciicircum{}',
+    '±': r'$\pm$',
+    '−': '$-$',
+    '×': r'$\times$',
+    '·': r'$\cdot$',
+    '≤': r'$\le$',
+    '≥': r'$\ge$',
+    '∞': r'$\infty$',
+    'ω': r'$\omega$',
+    '°': r'\textdegree{}',
+    '²': '$^2$',
+    '³': '$^3$',
+    '→': r'$\to$',
+}
+"""How LaTeX writes what it reads otherwise, or does not have in every font."""
+
+
+def _latex(text: str) -> str:
+    return ''.join(LATEX.get(sign, sign) for sign in text)
+
+
+def _latex_row(cells: Sequence[str], bold: bool = False) -> str:
+    written = [_latex(cell) for cell in cells]
+    if bold:
+        written[0] = rf'\textbf{{{written[0]}}}'
+    return f'    {" & ".join(written)} ' + r'\\'
+
+
+def _line(cells: Sequence[str]) -> str:
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
+
+
+# -- files, numbers and progress ------------------------------------------------------------------
 
 
 def progress_bar(

@@ -267,9 +267,7 @@ def test_the_exit_code_says_what_became_of_the_run(
     if unfinished:
         (tmp_path / 'recorded' / 'bag_1.mcap').write_bytes(b'\x89MCAP0\r\n')
     monkeypatch.setenv('AMENT_PREFIX_PATH', stand_ins(tmp_path, ends=ends)['AMENT_PREFIX_PATH'])
-    monkeypatch.setattr(
-        't3mpc_ros.cli.demo_run._watch', lambda processes, options: processes.check()
-    )
+    monkeypatch.setattr('t3mpc_ros.cli.demo._watch', lambda processes, options: processes.check())
     assert main(['demo', '--headless', '--output', str(tmp_path / 'run')]) == code
     output = capsys.readouterr()
     assert words in output.out + output.err

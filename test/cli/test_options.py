@@ -29,7 +29,7 @@ from support.parsers import commands, options
 from support.waiting import run
 
 from t3mpc_ros.cli import tune
-from t3mpc_ros.cli.demo_run import DemoOptions
+from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.comparison_runs import compare

@@ -887,10 +887,10 @@ def test_an_option_of_the_demo_reaches_its_node(words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(webbrowser, 'open', opened.append)
     for name, instead in (
-        ('cli.demo_run.ProcessGroup', Processes),
-        ('cli.demo_run.PrivateGraph', lambda: nullcontext(MagicMock(domain=1))),
-        ('cli.demo_run.time.monotonic', lambda: clock[0]),
-        ('cli.demo_run.time.sleep', lambda seconds: clock.append(clock.pop() + seconds)),
+        ('cli.process_group.ProcessGroup', Processes),
+        ('cli.process_group.PrivateGraph', lambda: nullcontext(MagicMock(domain=1))),
+        ('cli.demo.time.monotonic', lambda: clock[0]),
+        ('cli.demo.time.sleep', lambda seconds: clock.append(clock.pop() + seconds)),
         ('evaluation.bag_report.report_page.write_report', lambda *_: report),
     ):
         monkeypatch.setattr(f't3mpc_ros.{name}', instead)

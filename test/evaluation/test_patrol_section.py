@@ -22,7 +22,7 @@ import pytest
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference, patrol_blocks
 from t3mpc_ros.evaluation.bag_report.recorded_run import Series, load_run
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'

@@ -31,8 +31,7 @@ from t3mpc_ros.evaluation.api.script_inputs import as_controllers, check_method,
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
-from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.result_output import columns_of
+from t3mpc_ros.evaluation.result_output import Table, columns_of
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.table import find_names

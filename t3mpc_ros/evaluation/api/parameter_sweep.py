@@ -44,8 +44,7 @@ from t3mpc_ros.evaluation.experiment import (
     run_experiment,
 )
 from t3mpc_ros.evaluation.own_code import digest
-from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.result_output import columns_of
+from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.parameters.version_and_commit import provenance

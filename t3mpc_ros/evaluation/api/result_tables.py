@@ -27,8 +27,7 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.api.one_sentence_errors import one_sentence
-from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.result_output import write_columns
+from t3mpc_ros.evaluation.result_output import Table, write_columns
 from t3mpc_ros.parameters.command_line import check_writable
 from t3mpc_ros.parameters.version_and_commit import provenance
 from t3mpc_ros.script_error import ScriptError

@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.api.script_inputs import as_controllers, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import METRICS, START, Numbers, Record, measure, some_rows
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array

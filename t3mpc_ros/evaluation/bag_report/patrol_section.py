@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     visits,
 )
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import recorded_world

@@ -55,8 +55,7 @@ from t3mpc_ros.evaluation.html_page import (
     VerdictBox,
     html_page,
 )
-from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.result_output import format_number
+from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table, format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     REFERENCE,

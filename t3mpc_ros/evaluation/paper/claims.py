@@ -34,8 +34,7 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.fuzzy_estimation_error import KINDS
 from t3mpc_ros.evaluation.method_table import EXACT_MODEL, FULL
 from t3mpc_ros.evaluation.paper import paper_study
-from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.result_output import format_number
+from t3mpc_ros.evaluation.result_output import Table, format_number
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
 from t3mpc_ros.geometry.types import Array
 

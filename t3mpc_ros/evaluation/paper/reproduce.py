@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation import fuzzy_estimation_error, html_page, report_table, result_output
+from t3mpc_ros.evaluation import fuzzy_estimation_error, html_page, result_output
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.figure_style import write_pictures
 from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
@@ -154,7 +154,7 @@ class ExhibitData:
     results: Results
     showcase: paper_figures.FigureRuns
     claims: Sequence[Claim]
-    tables: Mapping[str, Sequence[report_table.Table]]
+    tables: Mapping[str, Sequence[result_output.Table]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,9 +373,9 @@ def counted(claims: Sequence[Claim]) -> str:
 def _claims(title: str, claims: Sequence[Claim], origin: str) -> html_page.Details:
     chosen = [claim for claim in claims if claim.origin == origin]
     rows = [
-        (claim.text, claim.found, report_table.verdict_mark(claim.verdict)) for claim in chosen
+        (claim.text, claim.found, result_output.verdict_mark(claim.verdict)) for claim in chosen
     ]
-    table = report_table.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
+    table = result_output.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
     return html_page.Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
@@ -383,8 +383,8 @@ def _exhibit(
     exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]
 ) -> html_page.Group:
     claims = exhibit.decided_by(material.claims)
-    found: list[Sequence[str | report_table.Mark]] = [
-        (f'{claim.text}: {claim.found}', report_table.verdict_mark(claim.verdict))
+    found: list[Sequence[str | result_output.Mark]] = [
+        (f'{claim.text}: {claim.found}', result_output.verdict_mark(claim.verdict))
         for claim in claims
     ]
     if not found:
@@ -394,7 +394,9 @@ def _exhibit(
         html_page.Items(found, 'side', 'Found here'),
     ]
     blocks: list[html_page.Block] = [
-        html_page.Heading(exhibit.title, report_table.verdict_mark(exhibit.mark(material.claims))),
+        html_page.Heading(
+            exhibit.title, result_output.verdict_mark(exhibit.mark(material.claims))
+        ),
         html_page.Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):

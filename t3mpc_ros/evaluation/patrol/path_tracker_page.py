@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.figure_style import TitledDrawing, new_figure
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
@@ -38,7 +38,7 @@ VERDICTS = {1: 'ours is better', -1: 'ours is worse', 0: 'inconclusive'}
 _DRAWN = {OURS: '#be123c', 'pure pursuit': '#0284c7', 'regulated pure pursuit': '#65a30d'}
 
 
-def path_table(study: TrackingStudy, path: str) -> report_table.Table:
+def path_table(study: TrackingStudy, path: str) -> result_output.Table:
     """Return errors, time and verdict of each method on a path."""
     head = ['method', 'error rms, mm', 'largest, mm', 'from the timed reference rms, mm']
     head += ['time, s', 'commands within the limits']
@@ -48,7 +48,7 @@ def path_table(study: TrackingStudy, path: str) -> report_table.Table:
     lines = []
     for name in study.plan.methods:
         rows = study.table.where(path=path, controller=name)
-        line: list[str | report_table.Mark] = [name]
+        line: list[str | result_output.Mark] = [name]
         for column in ('cross_track', 'largest', 'timed'):
             line.append(result_output.format_mean([1e3 * row[column] for row in rows], 2))
         line.append(_time([row['time'] for row in rows]))
@@ -56,15 +56,15 @@ def path_table(study: TrackingStudy, path: str) -> report_table.Table:
         own = {'path': path, 'controller': OURS}
         above = study.table.difference('cross_track', {**own, 'controller': name}, own)
         if name == OURS:
-            line += [report_table.EMPTY_CELL, report_table.EMPTY_CELL]
+            line += [result_output.EMPTY_CELL, result_output.EMPTY_CELL]
         elif above is not None:
             difference = format_interval(1e3 * above.mean, 1e3 * above.half, '+', 2)
-            line += [difference, report_table.verdict_mark(VERDICTS[above.sign])]
+            line += [difference, result_output.verdict_mark(VERDICTS[above.sign])]
         lines.append(line)
-    return report_table.Table(path.capitalize(), head, lines, (OURS,), wrap=True)
+    return result_output.Table(path.capitalize(), head, lines, (OURS,), wrap=True)
 
 
-def summary_table(study: TrackingStudy) -> report_table.Table:
+def summary_table(study: TrackingStudy) -> result_output.Table:
     """Return the rms error and the verdict of each method on each path."""
     lines = []
     for name in study.plan.methods:
@@ -78,7 +78,7 @@ def summary_table(study: TrackingStudy) -> report_table.Table:
             judged = f'; {VERDICTS[above.sign]}' if name != OURS and above is not None else ''
             line.append(result_output.format_mean(errors, 2) + judged)
         lines.append(line)
-    return report_table.Table(
+    return result_output.Table(
         'Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,)
     )
 
@@ -138,7 +138,7 @@ def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
 def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:
     """Return the choices of :func:`.path_tracker_comparison.tune_trackers` in Markdown."""
     tables = [
-        report_table.Table(
+        result_output.Table(
             f'{name}, seeds {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}',
             ('choice', 'error rms, mm'),
             [(choice, f'{1e3 * error:.2f}') for choice, error in each],

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation import html_page, report_table, result_output
+from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.evaluation.confidence_intervals import (
     Difference,
     format_interval,
@@ -147,16 +147,16 @@ def _time(times: Sequence[float]) -> str:
     return f'reached in {reached} of {len(times)}' if reached else 'not reached'
 
 
-def claims_table(study: PatrolStudy) -> report_table.Table:
+def claims_table(study: PatrolStudy) -> result_output.Table:
     """Return the claims with their verdicts."""
     rows = [
-        (text, report_table.verdict_mark(verdict), numbers)
+        (text, result_output.verdict_mark(verdict), numbers)
         for text, verdict, numbers in claims(study)
     ]
-    return report_table.Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
+    return result_output.Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
 
 
-def coverage_table(study: PatrolStudy) -> report_table.Table:
+def coverage_table(study: PatrolStudy) -> result_output.Table:
     """Return coverage, times, evenness and, on the twin, errors and contacts of each path."""
     shares = [f'{100.0 * share:g}' for share in SHARES]
     head = ['path', 'coverage, %', *(f'{share} %, s' for share in shares), 'evenness']
@@ -175,10 +175,10 @@ def coverage_table(study: PatrolStudy) -> report_table.Table:
             line.append(_cell(rows, 'avoiding', 1, 100.0))
             line.append(str(sum(row['contacts'] > 0 for row in rows)))
         lines.append(line)
-    return report_table.Table('Coverage of a 20 × 20 grid', head, lines, (OURS,), wrap=True)
+    return result_output.Table('Coverage of a 20 × 20 grid', head, lines, (OURS,), wrap=True)
 
 
-def surprise_table(study: PatrolStudy) -> report_table.Table:
+def surprise_table(study: PatrolStudy) -> result_output.Table:
     """Return skill of the observer, entropies and exponent of each path."""
     numbers = {
         **{f'skill at {horizon:g} s': f'skill_{horizon:g}' for horizon in HORIZONS},
@@ -199,7 +199,7 @@ def surprise_table(study: PatrolStudy) -> report_table.Table:
             words = bool(values) and isinstance(values[0], str)
             line.append(mode(values) if words else _cell(rows, column))
         lines.append(line)
-    return report_table.Table(
+    return result_output.Table(
         'How hard the path is to predict', ['path', *numbers], lines, (OURS,), wrap=True
     )
 

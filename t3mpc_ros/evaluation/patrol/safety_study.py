@@ -31,7 +31,7 @@ from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
 from t3mpc_ros.evaluation.patrol import patrol_run
-from t3mpc_ros.evaluation.report_table import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.run_record import RATE, Record, spans_of
 from t3mpc_ros.geometry.types import Array, State
 from t3mpc_ros.robot.sensor_mounts import sensor_mounts

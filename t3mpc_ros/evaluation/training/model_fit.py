@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
 from t3mpc_ros.evaluation.proposed_method import random_output_weights
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
 from t3mpc_ros.geometry.types import Array

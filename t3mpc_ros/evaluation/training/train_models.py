@@ -33,7 +33,7 @@ from t3mpc_ros.evaluation.proposed_method import (
     ProposedController,
     ProposedParameters,
 )
-from t3mpc_ros.evaluation.report_table import Table
+from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.evaluation.scenario import (
     PLANT_OF,

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.report_table import Table
-from t3mpc_ros.evaluation.result_output import strict_json
+from t3mpc_ros.evaluation.result_output import Table, strict_json
 from t3mpc_ros.evaluation.scenario import PLANT_OF, TUNING_SEEDS, Scenario
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
