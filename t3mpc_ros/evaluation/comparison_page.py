@@ -170,8 +170,7 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
     ]
     if not rows:
         return None
-    figure = new_figure(0.9 + 0.2 * len(rows))
-    axis = figure.subplots()
+    figure, axis = new_figure(0.9 + 0.2 * len(rows))
     places = np.arange(len(rows))[::-1]
     colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
     ends: list[float] = []
@@ -209,8 +208,7 @@ def draw_pareto(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
             points.append((variation, error))
     if len(points) < 2:
         return None
-    figure = new_figure(3.6)
-    axis = figure.subplots()
+    figure, axis = new_figure(3.6)
     best = front(points)
     axis.step(*zip(*(points[i] for i in best), strict=True), where='post', color='#9ca3af')
     for i, (method, point) in enumerate(zip(chosen, points, strict=True)):
@@ -234,8 +232,7 @@ def draw_seeds(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     finite = [each for values in rows.values() for each in values if math.isfinite(each)]
     if not finite:
         return None
-    figure = new_figure(0.9 + 0.2 * len(rows))
-    axis = figure.subplots()
+    figure, axis = new_figure(0.9 + 0.2 * len(rows))
     places = np.arange(len(rows))[::-1]
     names = []
     for place, (method, values) in zip(places, rows.items(), strict=True):

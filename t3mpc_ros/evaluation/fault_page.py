@@ -209,8 +209,7 @@ def _run_name(row: Row) -> str:
 
 def _draw_errors(rows: Sequence[Row]) -> Any:
     """Return a figure of the errors of each fault."""
-    figure = new_figure(0.9 + 0.19 * len(rows))
-    axis = figure.subplots()
+    figure, axis = new_figure(0.9 + 0.19 * len(rows))
     places = np.arange(len(rows))[::-1]
     for name, colour in _COLOURS.items():
         known = [(row[name], place) for row, place in zip(rows, places, strict=True)

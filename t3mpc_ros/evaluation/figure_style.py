@@ -146,17 +146,20 @@ class ShownFigure(Figure):
         return buffer.getvalue()
 
 
-def new_figure(height: float) -> Any:
-    """Return an empty figure of ``height`` inches, independent of pyplot."""
+def new_figure(height: float, shape: tuple[int, int] | None = None, **options: Any) -> Any:
+    """Return a figure of ``height`` inches, independent of pyplot, and its axis.
+
+    With a shape (rows, columns) the axes, an array of it.
+    """
     figure = ShownFigure(figsize=(WIDTH, height), layout='constrained')
     FigureCanvasAgg(figure)
-    return figure
+    return figure, figure.subplots(*shape or (1, 1), squeeze=shape is None, **options)
 
 
 def new_panels(count: int, height: float) -> tuple[Any, list[Any]]:
     """Return a figure and ``count`` panels of ``height`` inches with one common time axis."""
-    figure = new_figure(0.7 + height * count)
-    return figure, list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    figure, axes = new_figure(0.7 + height * count, (count, 1), sharex=True)
+    return figure, list(axes[:, 0])
 
 
 def whisker(half: float) -> float:
@@ -249,8 +252,7 @@ def lines_figure(time: Array, lines: Mapping[str, Array]) -> Any:
 
 def plane_figure(x: Array, y: Array, names: Sequence[str]) -> Any:
     """Return one line in the plane."""
-    figure = new_figure(4.2)
-    axis = figure.subplots()
+    figure, axis = new_figure(4.2)
     axis.plot(x, y, color=COLOURS['value'], lw=0.5)
     axis.set(xlabel=names[0], ylabel=names[1])
     return figure
@@ -258,8 +260,7 @@ def plane_figure(x: Array, y: Array, names: Sequence[str]) -> Any:
 
 def sweep_figure(lines: Mapping[str, Mapping[float, list[float]]], name: str, label: str) -> Any:
     """Return means with 95 % intervals over the values of a parameter, a line for each name."""
-    figure = new_figure(3.2)
-    axis = figure.subplots()
+    figure, axis = new_figure(3.2)
     for line, values in lines.items():
         ordered = sorted(values)
         means = [mean(values[value]) for value in ordered]

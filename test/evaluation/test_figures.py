@@ -684,8 +684,8 @@ def test_solutions_of_the_chaotic_system_are_drawn_by_state():
 
 def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
     def draw(values):
-        figure = figure_style.new_figure(2.0)
-        figure.subplots().plot(values)
+        figure, axis = figure_style.new_figure(2.0)
+        axis.plot(values)
         return figure
 
     files = {
@@ -714,8 +714,7 @@ def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
 )
 def test_the_ticks_of_an_axis_are_plain_numbers(values, near, scale):
     """Differences within 0.01 rad/s had ticks like -5.07817 x 10^-3."""
-    figure = figure_style.new_figure(2.0)
-    panel = figure.subplots()
+    figure, panel = figure_style.new_figure(2.0)
     panel.plot(values, values, 'o')
     figure_style.scale_by_size(panel, 'x', values, near)
     assert panel.get_xscale() == scale

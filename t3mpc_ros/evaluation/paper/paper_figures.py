@@ -238,8 +238,7 @@ COMMAND, MEASURED = figure_style.COLOURS['applied'], figure_style.COLOURS[ODOMET
 def path(showcase: FigureRuns) -> Any:
     """Return the path on the floor of the simulated robot, the paper's Fig. 8."""
     run = showcase.velocity
-    figure = figure_style.new_figure(5.0)
-    axis = figure.subplots()
+    figure, axis = figure_style.new_figure(5.0)
     reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
     axis.plot(*reference.T, color=REFERENCE_COLOUR, linewidth=1.0, label='reference')
     axis.plot(*driven.T, color=DRIVEN, linewidth=1.6, label='driven')
@@ -290,17 +289,16 @@ def portrait_in_words(showcase: FigureRuns) -> str:
 
 def portrait(run: Record) -> Any:
     """Return the phase portrait of the wheels and of their reference, Fig. 9 and 14."""
-    figure = figure_style.new_figure(3.4)
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, ((left, right),) = figure_style.new_figure(3.4, (1, 2), sharex=True, sharey=True)
     # The robot's way through a switch is part of its portrait, the reference's jump is not.
     reference = broken_at_switches(run, run.reference)
     for axis, values, colour, title in (
-        (axes[0], reference, REFERENCE_COLOUR, 'reference'),
-        (axes[1], run.speeds, DRIVEN, 'robot'),
+        (left, reference, REFERENCE_COLOUR, 'reference'),
+        (right, run.speeds, DRIVEN, 'robot'),
     ):
         axis.plot(values[:, 1], values[:, 0], color=colour, linewidth=0.8)
         axis.set(title=title, xlabel='left wheel / rad/s')
-    axes[0].set_ylabel('right wheel / rad/s')
+    left.set_ylabel('right wheel / rad/s')
     return figure
 
 
@@ -412,9 +410,9 @@ def run_and_zoom(
     if middle is not None:
         switch = run.time[middle]
         stretches.append(rows_between(run, switch - before, switch + after))
-    figure = figure_style.new_figure(4.6)
     ratios = {'width_ratios': (1.7, 1.0)[: len(stretches)]}
-    axes = figure.subplots(2, len(stretches), sharex='col', squeeze=False, gridspec_kw=ratios)
+    shape = 2, len(stretches)
+    figure, axes = figure_style.new_figure(4.6, shape, sharex='col', gridspec_kw=ratios)
     for i, wheel in enumerate(WHEELS):
         axes[i, 0].set(title=f'{wheel} wheel', ylabel=unit)
         for k, (axis, rows) in enumerate(zip(axes[i], stretches, strict=True)):
@@ -470,9 +468,9 @@ def rmse_bars(results: Results) -> Any:
         shown[drive] = sorted(rows, key=lambda row: float(row['rmse_mean']))
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
-    figure = figure_style.new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
-    axes = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
-    for axis, (drive, rows) in zip(axes, shown.items(), strict=True):
+    height = 0.9 + len(shown) * (0.5 + 0.23 * longest)
+    figure, axes = figure_style.new_figure(height, (len(shown), 1))
+    for axis, (drive, rows) in zip(axes[:, 0], shown.items(), strict=True):
         places = np.arange(len(rows))
         means, bounds = _bars(rows)
         bar_colours = [colours[row['controller']] for row in rows]
@@ -486,7 +484,7 @@ def rmse_bars(results: Results) -> Any:
         axis.set_xlim(left=0.0)
         axis.set_axisbelow(True)
         axis.set_title(f'{drive} drive, noise {PAPER_NOISE:g}')
-    axes[-1].set_xlabel('RMSE / rad/s')
+    axes[-1, 0].set_xlabel('RMSE / rad/s')
     return figure
 
 
@@ -497,9 +495,8 @@ def noise_growth(results: Results) -> Any:
         return None
     colours = colours_of(results)
     baselines = results.means.unique('controller', baseline=True)
-    figure = figure_style.new_figure(5.6 + 0.16 * len(baselines) / 3)
-    drives = results.drives
-    axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
+    drives, height = results.drives, 5.6 + 0.16 * len(baselines) / 3
+    figure, axes = figure_style.new_figure(height, (2, len(drives)), sharex=True, sharey='row')
     for column, drive in zip(axes.T, drives, strict=True):
         for i, name in enumerate([*baselines, FULL]):
             rows = [row for noise in noises if (row := results.row(name, drive, noise))]
@@ -532,10 +529,9 @@ def noise_growth(results: Results) -> Any:
 def ablation_bars(results: Results) -> Any:
     """Return the RMSE of the controller's stages in every case at the paper's noise."""
     drives = results.drives
-    figure = figure_style.new_figure(0.6 + 2.3 * len(drives))
-    panels = figure.subplots(len(drives), 1, squeeze=False)[:, 0]
+    figure, panels = figure_style.new_figure(0.6 + 2.3 * len(drives), (len(drives), 1))
     width = 0.85 / len(STAGES)
-    for axis, drive in zip(panels, drives, strict=True):
+    for axis, drive in zip(panels[:, 0], drives, strict=True):
         cases = results.cases(drive)
         for i, (stage, colour) in enumerate(zip(STAGES, _STAGE_COLOURS, strict=True)):
             rows = [row for case in cases if (row := results.row(stage, drive, PAPER_NOISE, case))]
@@ -550,7 +546,7 @@ def ablation_bars(results: Results) -> Any:
         axis.set_axisbelow(True)
         axis.set_ylim(bottom=0.0)
         axis.set(title=f'{drive} drive, noise {PAPER_NOISE:g}', ylabel='RMSE / rad/s')
-    figure_style.legend_above(figure, panels[0])
+    figure_style.legend_above(figure, panels[0, 0])
     return figure
 
 
@@ -558,8 +554,8 @@ def parts(results: Results) -> Any:
     """Return the effect of adding and of leaving out each part, with 95 % intervals."""
     drives = results.drives
     most = max(len(results.cases(drive)) for drive in drives)
-    figure = figure_style.new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
-    axes = figure.subplots(len(drives), len(PARTS), squeeze=False, sharey='row')
+    shape, height = (len(drives), len(PARTS)), 1.0 + len(drives) * (0.5 + 0.3 * most)
+    figure, axes = figure_style.new_figure(height, shape, sharey='row')
     for row, drive in zip(axes, drives, strict=True):
         cases = results.cases(drive)
         for axis, part, stage in zip(row, PARTS, STAGES[1:], strict=True):
@@ -597,8 +593,8 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
     shown = showcase.portraits
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = figure_style.new_figure(0.6 + 2.2 * rows)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    shape, height = (rows, columns), 0.6 + 2.2 * rows
+    figure, axes = figure_style.new_figure(height, shape, sharex=True, sharey=True)
     for axis in axes.flat[len(shown) :]:
         axis.set_visible(False)
     for axis, (name, run) in zip(axes.flat, shown.items(), strict=False):
@@ -616,8 +612,7 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
 def estimation_portraits(showcase: FigureRuns) -> Any:
     """Return phase portraits of (86) by kind of fuzzy system, the paper's Fig. 15."""
     shown = showcase.estimated
-    figure = figure_style.new_figure(2.7)
-    axes = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)
+    figure, axes = figure_style.new_figure(2.7, (1, len(shown)), sharex=True, sharey=True)
     true = showcase.driven
     palette = (OURS, figure_style.COLOURS['estimate'], figure_style.COLOURS['feedforward'])
     for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):

@@ -172,8 +172,8 @@ def record(study: TrackingStudy) -> dict[str, Any]:
 
 def draw_tracks(study: TrackingStudy) -> Any:
     """Return each path with the drives of ours and of the baselines, first seed."""
-    figure = new_figure(6.4)
-    axes = figure.subplots(2, 2, squeeze=False).ravel()
+    figure, axes = new_figure(6.4, (2, 2))
+    axes = axes.ravel()
     for axis in axes[len(study.plan.paths) :]:
         axis.set_visible(False)
     for axis, path in zip(axes, study.plan.paths, strict=False):

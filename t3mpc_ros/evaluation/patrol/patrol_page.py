@@ -284,8 +284,7 @@ def draw_paths(study: PatrolStudy) -> Any:
 
 def draw_coverage(study: PatrolStudy) -> Any:
     """Return the share of cells entered over time, the mean of the seeds."""
-    figure = new_figure(3.2)
-    axis = figure.subplots()
+    figure, axis = new_figure(3.2)
     for name, style in _styles(study.plan.paths):
         curve = np.mean(study.table.values('curve', controller=name), axis=0)
         time = np.linspace(0.0, study.plan.duration / 60.0, curve.size)
@@ -304,8 +303,7 @@ def draw_predictability(study: PatrolStudy) -> Any:
     columns = [f'skill_{horizon:g}' for horizon in HORIZONS]
     if not all(columns[0] in row for row in study.table):
         return None
-    figure = new_figure(3.2)
-    axis = figure.subplots()
+    figure, axis = new_figure(3.2)
     for place, (name, style) in enumerate(_styles(study.plan.paths)):
         values = [study.table.values(column, controller=name) for column in columns]
         halves = [whisker(interval(row)) for row in values]
@@ -337,8 +335,9 @@ def _panels(study: PatrolStudy) -> tuple[Any, list[tuple[Any, Row]]]:
     columns = min(2, len(drawn))
     rows = -(-len(drawn) // columns)
     left, bottom, right, top = study.plan.arena
-    figure = new_figure(0.4 + rows * (0.35 + 5.0 / columns * (top - bottom) / (right - left)))
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    height = 0.4 + rows * (0.35 + 5.0 / columns * (top - bottom) / (right - left))
+    figure, axes = new_figure(height, (rows, columns), sharex=True, sharey=True)
+    axes = axes.ravel()
     for axis, row in zip(axes, drawn, strict=False):
         axis.set_title(row['controller'])
     for axis in axes[len(drawn) :]:

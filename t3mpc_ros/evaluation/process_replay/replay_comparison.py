@@ -316,14 +316,15 @@ def write_divergence_figure(outcome: Comparison, path: Path) -> None:
 def _draw(outcome: Comparison) -> Any:
     first = outcome.first
     fields = [row.field for row in outcome.rows]
-    figure = figure_style.new_figure(2.0 + 0.16 * len(fields) + (3.6 if first else 0.0))
+    height = 2.0 + 0.16 * len(fields)
     if first is None:
-        _overview(figure.subplots(), outcome, fields)
+        figure, axis = figure_style.new_figure(height)
+        _overview(axis, outcome, fields)
         figure.suptitle(outcome.verdict(), fontsize=9)
         return figure
-    close, apart, all_of_it = figure.subplots(
-        3, 1, height_ratios=[1.8, 1.4, 0.6 + 0.16 * len(fields)]
-    )
+    ratios = [1.8, 1.4, 0.6 + 0.16 * len(fields)]
+    figure, axes = figure_style.new_figure(height + 3.6, (3, 1), height_ratios=ratios)
+    close, apart, all_of_it = axes[:, 0]
     close.sharex(apart)
     _close_up(close, apart, outcome, first.field, first.first)
     _overview(all_of_it, outcome, fields)
