@@ -46,9 +46,8 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
-from t3mpc_ros.evaluation.controller_adapters import NodeDriver, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable, Row, map_jobs
-from t3mpc_ros.evaluation.loop import ReportLink
+from t3mpc_ros.evaluation.loop import NodeDriver, NodeMethod, ReportLink
 from t3mpc_ros.evaluation.method_table import (
     EXACT_MODEL,
     FEED_FORWARD,

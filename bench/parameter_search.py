@@ -44,9 +44,8 @@ from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward
 from t3mpc_ros.evaluation.cases import CASES, cases_for
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import WorkerPool
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import MethodSpec, NodeMethod, run
 from t3mpc_ros.evaluation.method_table import FEED_FORWARD, feed_forward_parameters
 from t3mpc_ros.evaluation.run_record import Numbers, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario

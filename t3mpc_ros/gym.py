@@ -29,8 +29,7 @@ from t3mpc_ros.evaluation.api.own_robot import NoiseLaw
 from t3mpc_ros.evaluation.api.script_inputs import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import LinkFaults
-from t3mpc_ros.evaluation.controller_adapters import MethodDriver
-from t3mpc_ros.evaluation.loop import scenario_reports, with_scenario
+from t3mpc_ros.evaluation.loop import MethodDriver, scenario_reports, with_scenario
 from t3mpc_ros.evaluation.run_record import RATE, Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, Array

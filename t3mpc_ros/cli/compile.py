@@ -81,8 +81,7 @@ def _compile_robots() -> None:
 def _compile_controllers() -> None:
     from t3mpc_ros.control.controller import Controller, StepperControllerParameters
     from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
-    from t3mpc_ros.evaluation.controller_adapters import MethodSpec
-    from t3mpc_ros.evaluation.loop import run
+    from t3mpc_ros.evaluation.loop import MethodSpec, run
     from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
     from t3mpc_ros.evaluation.scenario import Scenario
 

@@ -30,9 +30,8 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     interval,
     mean,
 )
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.loop import ComparedMethod, scenario_reports
+from t3mpc_ros.evaluation.loop import ComparedMethod, MethodSpec, scenario_reports
 from t3mpc_ros.evaluation.method_table import FEED_FORWARD, FULL, MODEL_ERROR
 from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.scenario import LEAD, PRETRAINING_SEEDS, TUNING_SEEDS, Scenario

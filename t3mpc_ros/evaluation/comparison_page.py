@@ -39,9 +39,9 @@ from t3mpc_ros.evaluation.comparison import (
     summary_table,
 )
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.figure_style import drawing, file_of, new_figure, scale_by_size, whisker
+from t3mpc_ros.evaluation.loop import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.run_record import METRICS, VARIATION
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.version_and_commit import machine, provenance

@@ -42,8 +42,7 @@ from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec
-from t3mpc_ros.evaluation.loop import Method, run
+from t3mpc_ros.evaluation.loop import Method, MethodSpec, run
 from t3mpc_ros.evaluation.own_code import ModuleCarrier
 from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import Record, measure

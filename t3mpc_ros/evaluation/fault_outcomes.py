@@ -27,9 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.controller_adapters import NodeMethod
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import NodeMethod, run
 from t3mpc_ros.evaluation.method_table import FULL
 from t3mpc_ros.evaluation.run_record import RATE, STATUS_FLAGS, Record, rolling_speeds
 from t3mpc_ros.evaluation.scenario import (

@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import AdaptiveIntervalType
 from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.loop import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import KINDS, PLANT_OF, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange

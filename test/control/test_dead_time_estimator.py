@@ -31,7 +31,7 @@ from t3mpc_ros.control.dead_time_estimator import (
     DeadTimeEstimator,
 )
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
-from t3mpc_ros.evaluation.controller_adapters import NodeMethod
+from t3mpc_ros.evaluation.loop import NodeMethod
 from t3mpc_ros.evaluation.loop import run as run_loop
 from t3mpc_ros.evaluation.scenario import Scenario
 

@@ -52,8 +52,7 @@ from t3mpc_ros.evaluation.comparison import (
 )
 from t3mpc_ros.evaluation.comparison_page import front, record
 from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, paired
-from t3mpc_ros.evaluation.controller_adapters import MethodDriver, MethodSpec, NodeMethod
-from t3mpc_ros.evaluation.loop import ReportLink, run
+from t3mpc_ros.evaluation.loop import MethodDriver, MethodSpec, NodeMethod, ReportLink, run
 from t3mpc_ros.evaluation.method_table import (
     FEED_FORWARD,
     FULL,

@@ -21,7 +21,7 @@ from support.long_tests import few_of
 
 from bench import fault_comparison
 from bench.fault_comparison import FAULTS, Fault, Job, first_said, run_job
-from t3mpc_ros.evaluation.controller_adapters import NodeMethod
+from t3mpc_ros.evaluation.loop import NodeMethod
 from t3mpc_ros.evaluation.method_table import FEED_FORWARD, FULL
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.simulation.fault_schedule import FaultEvent

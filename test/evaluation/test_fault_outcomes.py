@@ -25,8 +25,7 @@ from support.long_tests import few_of
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import fault_outcomes, fault_page
-from t3mpc_ros.evaluation.controller_adapters import NodeMethod
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import NodeMethod, run
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario, noisy_twin, sampled_speeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON

@@ -22,13 +22,12 @@ import pytest
 from support.records import record_of
 
 from t3mpc_ros.control.velocity_command import VelocityActuation
-from t3mpc_ros.evaluation import controller_adapters
+from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import CASES, NO_FAULTS, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
-from t3mpc_ros.evaluation.controller_adapters import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.experiment import JobError, WorkerPool
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import MadeMethod, MethodSpec, run
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import (
@@ -418,7 +417,7 @@ class NotingActuation(VelocityActuation):
 def test_estimator_gets_every_measurement_once_in_order(robot, monkeypatch):
     scenario = Scenario(robot, 'nominal', 6, 1.0)
     expected = run(scenario, P)
-    monkeypatch.setattr(controller_adapters, 'VelocityActuation', NotingActuation)
+    monkeypatch.setattr(loop, 'VelocityActuation', NotingActuation)
     record, log = run(scenario, P), NotingActuation.log
     assert [entry[0] for entry in log] == ['reset', *['observe', 'send'] * 100]
     np.testing.assert_array_equal(log[0][1], record['measured'][0])
@@ -427,7 +426,7 @@ def test_estimator_gets_every_measurement_once_in_order(robot, monkeypatch):
 
 
 def test_method_and_estimator_know_of_lost_measurements(monkeypatch):
-    monkeypatch.setattr(controller_adapters, 'VelocityActuation', NotingActuation)
+    monkeypatch.setattr(loop, 'VelocityActuation', NotingActuation)
     scenario = Scenario('servo', 'dropouts', 2, 10.0)
     record, method = noted(Noting, scenario)
     elapsed = np.array([seen.elapsed for seen in method.seen])
@@ -469,7 +468,7 @@ def test_what_does_not_fit_the_loop_is_refused(monkeypatch):
     scenario = Scenario('servo', 'nominal', 1, 1.0, noise=0.0)
     for dead_time, text in ((0.013, 'dead time must be whole periods'), (0.2, 'at most 0.0')):
         with monkeypatch.context() as patch:
-            patch.setattr(controller_adapters, 'VelocityActuation', NotingActuation)
+            patch.setattr(loop, 'VelocityActuation', NotingActuation)
             patch.setattr(NotingActuation, 'assumed', dead_time)
             with pytest.raises(ValueError, match=text):
                 run(scenario, P)
@@ -632,8 +631,8 @@ class Counting(BaselineController):
 
 
 def test_pretraining_carries_weights_from_run_to_run(monkeypatch):
-    assert controller_adapters.PRETRAINING_DURATION == 40.0
-    monkeypatch.setattr(controller_adapters, 'PRETRAINING_DURATION', 4.0)
+    assert loop.PRETRAINING_DURATION == 40.0
+    monkeypatch.setattr(loop, 'PRETRAINING_DURATION', 4.0)
     nominal_model = Scenario('torque', 'nominal', 101, noise=0.0).nominal_model()
     fresh = MethodSpec('count', Counting, ProportionalParameters())(nominal_model)
     pretrained = MethodSpec('count', Counting, ProportionalParameters(), pretrained=True)

@@ -35,9 +35,15 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults, cases_for
 from t3mpc_ros.evaluation.comparison_page import draw_seeds, record
-from t3mpc_ros.evaluation.controller_adapters import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
-from t3mpc_ros.evaluation.loop import reports_of, run, run_loop
+from t3mpc_ros.evaluation.loop import (
+    MethodDriver,
+    MethodSpec,
+    NodeDriver,
+    reports_of,
+    run,
+    run_loop,
+)
 from t3mpc_ros.evaluation.method_table import (
     FEED_FORWARD,
     FULL,

@@ -25,8 +25,7 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import paired
-from t3mpc_ros.evaluation.controller_adapters import MadeMethod, MethodSpec
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import MadeMethod, MethodSpec, run
 from t3mpc_ros.evaluation.method_table import methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.run_record import RATE

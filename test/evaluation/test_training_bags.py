@@ -21,8 +21,7 @@ from support.training_runs import START, STEP, TrainingRun
 
 from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import MethodSpec, run
 from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario

@@ -26,8 +26,8 @@ import pytest
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import ROBOTS
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.experiment import JobError
+from t3mpc_ros.evaluation.loop import MethodSpec
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
 from t3mpc_ros.evaluation.method_table import (
     further_definitions,

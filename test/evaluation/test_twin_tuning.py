@@ -22,8 +22,7 @@ import pytest
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegralParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.controller_adapters import NodeMethod
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import NodeMethod, run
 from t3mpc_ros.evaluation.method_table import (
     EXACT_MODEL,
     FULL,

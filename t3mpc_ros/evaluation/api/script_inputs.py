@@ -50,8 +50,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS, LinkFaults
-from t3mpc_ros.evaluation.controller_adapters import MethodDriver, MethodSpec, NodeMethod
-from t3mpc_ros.evaluation.loop import ComparedMethod
+from t3mpc_ros.evaluation.loop import ComparedMethod, MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.method_table import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry

@@ -21,8 +21,8 @@ import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec
 from t3mpc_ros.evaluation.experiment import ResultTable, Row, Run
+from t3mpc_ros.evaluation.loop import MethodSpec
 from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.method_table import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.own_code import digest

@@ -25,9 +25,8 @@ from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcController
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec, pretrain
 from t3mpc_ros.evaluation.experiment import Job, Run, print_report, run_experiment
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import MethodSpec, pretrain, run
 from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import (
     ProposedController,

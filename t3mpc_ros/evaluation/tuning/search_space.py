@@ -28,8 +28,7 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
-from t3mpc_ros.evaluation.controller_adapters import MethodSpec, NodeMethod
-from t3mpc_ros.evaluation.loop import Method
+from t3mpc_ros.evaluation.loop import Method, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.scenario import PLANT_OF
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint, short_name
