@@ -43,17 +43,19 @@ from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, free_cells
-from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, coverage_at, visits
+from t3mpc_ros.evaluation.patrol.patrol_metrics import (
+    CoverageGrid,
+    coverage_at,
+    delay_vectors,
+    resampled,
+    square_distances,
+    visits,
+)
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     LIMITS,
     PatrolScenario,
     portrait_points,
     run_patrol,
-)
-from t3mpc_ros.evaluation.patrol.predictability import (
-    delay_vectors,
-    resampled,
-    square_distances,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with StopSignal() as stop:
         try:
             prepare_outputs(options)
-            return int(options.run(options, stop))
+            return int(options.run(options, stop) or EXIT_OK)
         except (ProcedureError, KeyFileError, ParameterError) as error:
             if stop():
                 # The reason is another one where the radio of the dongle could not be restored.
@@ -85,33 +85,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # -- the key --------------------------------------------------------------------------------------
 
 
-def _create_key(options: argparse.Namespace, stop: StopSignal) -> int:
+def _create_key(options: argparse.Namespace, stop: StopSignal) -> None:
     check = key_provisioning.create_key_file(options.file, os.urandom)
     print(
         f'{options.file}: new key, check value {check:08x}, readable by its owner only. Keep it: '
         'the robot follows no commands without it. Next: t3mpc robot key write'
     )
-    return EXIT_OK
 
 
-def _check_key(options: argparse.Namespace, stop: StopSignal) -> int:
+def _check_key(options: argparse.Namespace, stop: StopSignal) -> None:
     check = f'{key_check(read_key(options.file)):08x}'
     text = f'{options.file}: a key, check value {check}'
     print_result(options, lambda: text, lambda: {'check': check})
-    return EXIT_OK
 
 
-def _write_key(options: argparse.Namespace, stop: StopSignal) -> int:
+def _write_key(options: argparse.Namespace, stop: StopSignal) -> None:
     key = read_key(options.file)
     key_state = _run_at_board(key_provisioning.write_key(key), options, stop)
     print(key_provisioning.format_key_state(key_state) + ', equal to the file')
-    return EXIT_OK
 
 
-def _erase_key(options: argparse.Namespace, stop: StopSignal) -> int:
+def _erase_key(options: argparse.Namespace, stop: StopSignal) -> None:
     script = key_provisioning.write_key(key_provisioning.ERASE_KEY)
     print(key_provisioning.format_key_state(_run_at_board(script, options, stop)))
-    return EXIT_OK
 
 
 def _show_key_state(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -179,10 +175,9 @@ def _store_settings(
     return _run_at_board(robot_settings.write_settings(wanted), options, stop)
 
 
-def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
+def _show_log(options: argparse.Namespace, stop: StopSignal) -> None:
     entries = _run_at_board(robot_info.read_log(), options, stop)
     print_result(options, lambda: robot_info.format_log(entries), lambda: entries)
-    return EXIT_OK
 
 
 def _load_settings(path: Path) -> robot_settings.RobotSettings:
@@ -222,13 +217,12 @@ def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
     return EXIT_OK if good else EXIT_POOR
 
 
-def _show_parameters(options: argparse.Namespace, stop: StopSignal) -> int:
+def _show_parameters(options: argparse.Namespace, stop: StopSignal) -> None:
     parameters = _link_parameters(options)
     script = robot_info.read_robot_info(parameters, _key_option(options), os.urandom)
     robot = _run_at_dongle(script, options, stop)
     text = robot_info.format_robot_info(robot, parameters)
     print_result(options, lambda: text, lambda: robot)
-    return EXIT_OK
 
 
 def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -386,7 +380,10 @@ def program_parser() -> argparse.ArgumentParser:
     _add_key_commands(commands)
 
     def link_command(
-        name: str, run: Callable[[argparse.Namespace, StopSignal], int], text: str, key: bool
+        name: str,
+        run: Callable[[argparse.Namespace, StopSignal], int | None],
+        text: str,
+        key: bool,
     ) -> argparse.ArgumentParser:
         command: argparse.ArgumentParser = commands.add_parser(name, help=text)
         command.set_defaults(run=run)

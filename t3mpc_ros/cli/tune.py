@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
         require_libraries,
     )
     from t3mpc_ros.evaluation.tuning import tune_methods
-    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TuningBudget
+    from t3mpc_ros.evaluation.tuning.tuned_parameters import TuningBudget
     from t3mpc_ros.parameters.table import find_names
 
     known = [*method_definitions(), *further_definitions()]

@@ -33,14 +33,21 @@ from t3mpc_ros.evaluation.baselines.feed_forward import (
     LmsBodyCorrectionParameters,
 )
 from t3mpc_ros.evaluation.baselines.feedback_control import AdaptiveIntervalType2, AdaptiveType1
-from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
-from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
+from t3mpc_ros.evaluation.baselines.model_predictive_control import (
+    CasadiNmpc,
+    LinearMpc,
+    LinearMpcPreview,
+)
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.loop import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import KINDS, PLANT_OF, Scenario
-from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import PACKAGED_FILE, TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+    PACKAGED_FILE,
+    MethodDefinition,
+    SearchRange,
+    TunedParameters,
+)
 from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'

@@ -31,14 +31,12 @@ from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrixPreview,
     identify_step_responses,
 )
-from t3mpc_ros.evaluation.baselines.linear_mpc import (
+from t3mpc_ros.evaluation.baselines.model_predictive_control import (
+    CasadiNmpc,
+    CasadiNmpcParameters,
     LinearMpc,
     LinearMpcParameters,
     LinearMpcPreview,
-)
-from t3mpc_ros.evaluation.baselines.nonlinear_mpc import (
-    CasadiNmpc,
-    CasadiNmpcParameters,
     condense,
     wheel_dynamics,
 )

@@ -48,8 +48,7 @@ from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     TrackingStudy,
 )
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
-from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, visits
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
+from t3mpc_ros.evaluation.patrol.patrol_metrics import HORIZONS, CoverageGrid, visits
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,

@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation.paper.reproduce import run_study
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TunedParameters, TuningBudget
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters, TuningBudget
 
 measured_patrol = cache(patrol_comparison.measured_patrol)
 

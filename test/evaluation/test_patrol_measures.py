@@ -20,21 +20,19 @@ import pytest
 
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, LANES, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
+    HORIZONS,
     CoverageGrid,
     coverage_at,
-    evenness,
-    patrol_metrics,
-    time_to_cover,
-    visits,
-)
-from t3mpc_ros.evaluation.patrol.predictability import (
-    HORIZONS,
     delay_vectors,
     divergence,
+    evenness,
     ordinal_shares,
+    patrol_metrics,
     permutation_entropy,
     predictability,
     spectral_entropy,
+    time_to_cover,
+    visits,
 )
 
 AREA = Rectangle((-1.8, -1.3), (1.8, 1.3))

@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation.method_table import methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import StoreError, TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameters import StoreError, TunedParameters
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
 from t3mpc_ros.simulation.paper_robot import PaperRobot

@@ -172,7 +172,7 @@ def test_a_comparison_is_drawn(browser, tmp_path):
         write(tmp_path / name, following_rows(offset=offset))
         for name, offset in (('one', 0.02), ('two', 0.03))
     ]
-    path = write_comparison(folders, tmp_path).path
+    path, *_ = write_comparison(folders, tmp_path)
     opened(browser, path)
     assert browser.select('.headline').text == 'Larger settled error'
     assert {len(found) for found in browser.run('return charts.charts.map((c) => c.series)')} == {

@@ -25,9 +25,8 @@ from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.paper.paper_study import Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
-from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
+from t3mpc_ros.evaluation.patrol.patrol_metrics import HORIZONS, SHARES
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,
     FieldComparison,

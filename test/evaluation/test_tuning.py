@@ -37,11 +37,6 @@ from t3mpc_ros.evaluation.method_table import (
 )
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import search_best
-from t3mpc_ros.evaluation.tuning.search_space import (
-    MethodDefinition,
-    SearchRange,
-    SearchSpace,
-)
 import t3mpc_ros.evaluation.tuning.tune_methods as tune_module
 from t3mpc_ros.evaluation.tuning.tune_methods import (
     ClosedLoopObjective,
@@ -49,9 +44,12 @@ from t3mpc_ros.evaluation.tuning.tune_methods import (
     objective,
     tune_methods,
 )
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
+from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     PACKAGED_FILE,
     SMOOTHNESS,
+    MethodDefinition,
+    SearchRange,
+    SearchSpace,
     StoreError,
     TunedEntry,
     TunedParameters,

@@ -47,7 +47,7 @@ from t3mpc_ros.evaluation.tuning.tune_methods import (
     twin_definitions,
     twin_objective,
 )
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameters import SMOOTHNESS, TunedParameters
 
 PI = 'PI + feed-forward'
 

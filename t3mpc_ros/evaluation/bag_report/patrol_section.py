@@ -24,6 +24,7 @@ from t3mpc_ros.evaluation.bag_report.recorded_run import Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import on_reference_frame
 from t3mpc_ros.evaluation.html_page import Block, Chart, Heading, Line, Paragraph
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
+    HORIZONS,
     SHARES,
     SHORTEST,
     CoverageGrid,
@@ -31,7 +32,6 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     patrol_metrics,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array

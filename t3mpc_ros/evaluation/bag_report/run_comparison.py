@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -81,16 +80,6 @@ DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
 """What is compared of two robots that follow poses."""
 VERDICTS = {-1: 'smaller error', 0: 'inconclusive', 1: 'larger error'}
 """By the sign of a difference."""
-
-
-class WrittenComparison(NamedTuple):
-    """A comparison that has been written."""
-
-    path: Path
-    text: str
-    """Verdicts on the runs, and of each against the first, a line each."""
-    record: Mapping[str, object]
-    """The same with the main numbers, as plain data."""
 
 
 @dataclass(frozen=True)
@@ -203,8 +192,12 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
 
 def write_comparison(
     folders: Sequence[Path], output: Path, wanted: ReportOptions | None = None
-) -> WrittenComparison:
-    """Compare each bag with the first in ``comparison.html``."""
+) -> tuple[Path, str, dict[str, object]]:
+    """Compare each bag with the first in ``comparison.html``; return its path and what it says.
+
+    As text the verdicts on the runs, and of each against the first, a line each; as plain data the
+    same with the main numbers.
+    """
     if not 2 <= len(folders) <= MAX_RUNS:
         raise ReportError(f'a comparison must have 2 to {MAX_RUNS} bags: got {len(folders)}')
     path = output / PAGE
@@ -224,7 +217,7 @@ def write_comparison(
     write_atomically(path, html_page(title, blocks))
     lines = [f'{each.label}: {each.metrics.verdict.text()}' for each in runs]
     lines += [f'{each.subject}: {each.headline}: {"; ".join(each.reasons)}' for each in verdicts]
-    record = {
+    record: dict[str, object] = {
         'report': str(path),
         'runs': {each.label: each.metrics.to_dict() for each in runs},
         'verdicts': [
@@ -232,7 +225,7 @@ def write_comparison(
             for each in verdicts
         ],
     }
-    return WrittenComparison(path, '\n'.join(lines), record)
+    return path, '\n'.join(lines), record
 
 
 def _load(number: int, folder: Path, path: Path, wanted: ReportOptions | None) -> ComparedRun:

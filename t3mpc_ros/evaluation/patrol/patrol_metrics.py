@@ -11,26 +11,457 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""All figures of a patrol from its path: coverage, evenness, entropies, exponent and skill."""
+"""All figures of a patrol from its path: coverage, evenness, entropies, exponent and skill.
 
+The observer records positions without error, learns from the first half alone, and then states at
+each instant of the second half where the robot will be, from what he has seen up to then. He has
+several predictors, each fitted separately for each horizon:
+
+* persistence: the robot stays where it is; constant velocity; an arc of constant speed and turn
+  rate;
+* linear: ridge regression on delay vectors (an autoregression);
+* analogues: the mean of what followed the most similar delay vectors of the first half
+  (Lorenz, J. Atmos. Sci. 26, 1969, doi 10.1175/1520-0469(1969)26<636:APARBN>2.0.CO;2; Farmer and
+  Sidorowich, Phys. Rev. Lett. 59, 1987, doi 10.1103/PhysRevLett.59.845);
+* kernel: kernel ridge regression with a Gaussian kernel on delay vectors (Saunders, Gammerman and
+  Vovk, ICML 1998).
+
+Their settings are chosen on the last third of the first half. For each horizon the predictor that
+turns out best **on the second half** counts, which is in favour of the observer: the figure is an
+upper bound of what these predictors attain.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.predictability import (
-    check_path,
-    delay_vectors,
-    divergence,
-    normalised_entropy,
-    permutation_entropy,
-    predictability,
-    resampled,
-    spectral_entropy,
-)
 from t3mpc_ros.geometry.types import Array
+
+_BLOCK = 512
+
+
+def check_path(t: Array, x: Array, y: Array) -> None:
+    """Raise ValueError when t, x, y are no path: shape (n,), n >= 2, finite, t increasing."""
+    if not t.ndim == x.ndim == y.ndim == 1 or not t.size == x.size == y.size >= 2:
+        raise ValueError(
+            't, x, y must have one shape (n,) with n >= 2: '
+            f'got {np.shape(t)}, {np.shape(x)}, {np.shape(y)}'
+        )
+    if not all(np.isfinite(each).all() for each in (t, x, y)):
+        raise ValueError('t, x, y must be finite')
+    if not (np.diff(t) > 0.0).all():
+        raise ValueError('t must increase from sample to sample')
+
+
+def resampled(t: Array, x: Array, y: Array, step: float) -> Array:
+    """Return the positions at intervals of ``step`` (s), linearly interpolated, shape (m, 2).
+
+    ValueError: not a path, see :func:`check_path`, or one shorter than a step.
+    """
+    check_path(t, x, y)
+    duration = float(t[-1] - t[0])
+    if not 0.0 < step <= duration:
+        raise ValueError(f'step must be above 0 and at most {duration:g} s: got {step:g}')
+    times = t[0] + step * np.arange(int(duration / step + 1e-9) + 1)
+    return np.column_stack([np.interp(times, t, x), np.interp(times, t, y)])
+
+
+def delay_vectors(series: Array, lags: Sequence[int]) -> Array:
+    """Return one row (s[n - lag] for each lag) for each n that has them all.
+
+    ``series`` has the shape (n, d), the result (n - lags[-1], d * len(lags)). ``lags`` are samples
+    into the past, ascending from 0; row 0 is of n = lags[-1].
+    """
+    deepest = lags[-1]
+    if not 0 <= deepest < len(series):
+        raise ValueError(f'lags must be below the {len(series)} samples: got {deepest}')
+    return np.hstack([series[deepest - lag : len(series) - lag] for lag in lags])
+
+
+def square_distances(a: Array, b: Array) -> Array:
+    """Return the squared Euclidean distances between rows, shape (len(a), len(b))."""
+    squares: Array = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)[None, :] - 2.0 * a @ b.T
+    return np.maximum(squares, 0.0)
+
+
+def nearest_apart(points: Array, count: int, apart: int) -> NDArray[np.int64]:
+    """Return the nearest neighbour of each of the first ``count`` points among the same.
+
+    It is more than ``apart`` samples away in time (Theiler 1986: points of the same piece of the
+    path are no recurrence) and at a distance above zero; -1 where there is none.
+    """
+    found = np.full(count, -1, dtype=np.int64)
+    own = points[:count]
+    places = np.arange(count)
+    for start in range(0, count, _BLOCK):
+        rows = places[start : start + _BLOCK]
+        # Differences, not products: close neighbours would drown in rounding.
+        squares = np.zeros((rows.size, count))
+        for column in own.T:
+            squares += (column[rows, None] - column[None, :]) ** 2
+        squares[(np.abs(rows[:, None] - places[None, :]) <= apart) | (squares == 0.0)] = np.inf
+        best = squares.argmin(axis=1)
+        found[rows] = np.where(np.isfinite(squares[np.arange(rows.size), best]), best, -1)
+    return found
+
+
+# -- entropy --------------------------------------------------------------------------------------
+
+
+def normalised_entropy(shares: Array) -> float:
+    """Return the Shannon entropy of shares that add up to 1, relative to that of equal ones."""
+    held = shares[shares > 0.0]
+    return float(-(held * np.log(held)).sum() / math.log(shares.size)) + 0.0
+
+
+def ordinal_shares(series: Array, order: int) -> Array:
+    """Return how often each order of size of ``order`` values occurs, shape (order!,).
+
+    Of equal values the earlier one counts as the smaller. The patterns are in the lexicographic
+    order of the ranks.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(series, order).T
+    ranks = windows.argsort(axis=0, kind='stable').argsort(axis=0, kind='stable')
+    # The number of a permutation in the factorial number system (Lehmer code).
+    number = np.zeros(ranks.shape[1], dtype=np.int64)
+    for k in range(order):
+        smaller = (ranks[k + 1 :] < ranks[k]).sum(axis=0)
+        number += smaller * math.factorial(order - 1 - k)
+    return np.bincount(number, minlength=math.factorial(order)) / number.size
+
+
+def permutation_entropy(series: Array, order: int = 4) -> float:
+    """Return the entropy of the ordinal patterns, from 0 (monotone) to 1 (white noise).
+
+    Bandt and Pompe, Phys. Rev. Lett. 88, 2002 (doi 10.1103/PhysRevLett.88.174102), divided by
+    ln(order!). From N patterns white noise gives about (order! - 1) / (2 N ln(order!)) less
+    than 1.
+
+    ``series`` are uniform samples, shape (n,); ``order`` is the number of values in a pattern.
+    """
+    return normalised_entropy(ordinal_shares(series, order))
+
+
+SEGMENT = 64
+"""Samples of a segment of the spectrum, which has half as many frequencies."""
+
+
+def spectral_entropy(series: Array) -> float:
+    r"""Return the entropy of the power spectrum, from 0 (one line) to 1 (all alike).
+
+    Shannon entropy of the shares of power of the frequencies above zero, relative to that of a
+    flat spectrum (Inouye et al., Electroencephalogr. Clin. Neurophysiol. 79, 1991,
+    doi 10.1016/0013-4694(91)90138-T). The spectrum is Welch's, with Hann windows that do not
+    overlap. From K segments with N frequencies white noise gives about
+
+    .. math:: 1 - (\psi(K + 1) - \ln K) / \ln N, \qquad \psi(K + 1) - \ln K \approx 1 / (2 K)
+
+    NaN for a constant series. ``series`` are at least :data:`SEGMENT` uniform samples, shape (n,).
+    """
+    count = series.size // SEGMENT
+    pieces = series[: count * SEGMENT].reshape(count, SEGMENT)
+    pieces = pieces - series.mean()
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(SEGMENT) / SEGMENT)
+    power = (np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2).mean(axis=0)[1:]
+    total = power.sum()
+    if total <= 1e-24 * SEGMENT**2 * max(1.0, float(np.abs(series).max()) ** 2):
+        return math.nan
+    return normalised_entropy(power / total)
+
+
+# -- exponent -------------------------------------------------------------------------------------
+
+
+FITTED = 0.8
+"""Share of the way of the logarithmic distance that is fitted."""
+
+
+def divergence(points: Array, step: float, apart: int, horizon: int) -> float:
+    """Return the largest exponent (1/s) by the method of Rosenstein, Collins and De Luca.
+
+    Physica D 65, 1993 (doi 10.1016/0167-2789(93)90009-P): the slope of the mean logarithmic
+    distance of each point from its nearest neighbour, both followed in time. The slope is that
+    of a straight line, by least squares, over the first part of the way of the distance, in
+    logarithms, to that of two random points: beyond it the size of the attractor bounds the
+    distance. It is within 6 % for the logistic map, the Hénon map and the Lorenz system from 3000
+    to 5000 points.
+
+    Any data give a number. Noise has no exponent: there the number grows without bound as the
+    samples become denser, and compares only with that of other paths of the same sampling.
+
+    ``points`` are delay vectors or states at times ``step`` (s) apart, shape (n, d); neighbours
+    are more than ``apart`` samples from each other in time, about a mean period, and are followed
+    for ``horizon`` samples. ValueError: there are too few points, or no point has a neighbour.
+    """
+    count = len(points) - horizon
+    if horizon < 2 or count <= apart + 1:
+        raise ValueError(
+            f'points must be more than horizon + apart + 1 = {horizon + apart + 1}, with '
+            f'horizon >= 2: got {len(points)} and {horizon}'
+        )
+    neighbour = nearest_apart(points, count, apart)
+    own = np.flatnonzero(neighbour >= 0)
+    if not own.size:
+        raise ValueError('no point has a neighbour at a distance above zero')
+    other = neighbour[own]
+    logs = np.empty(horizon + 1)
+    for k in range(horizon + 1):
+        logs[k] = _mean_log(points[own + k] - points[other + k])
+    # Points half of the data apart stand for random pairs.
+    half = len(points) // 2
+    limit = _mean_log(points[: len(points) - half] - points[half:])
+    time: Array = step * np.arange(horizon + 1, dtype=np.float64)
+    reached = np.flatnonzero(logs >= logs[0] + FITTED * (limit - logs[0]))
+    last = int(reached[0]) if reached.size else horizon
+    rows = slice(0, max(last, 2) + 1)  # three points at least
+    return float(np.polyfit(time[rows], logs[rows], 1)[0])
+
+
+def _mean_log(differences: Array) -> float:
+    squares = (differences * differences).sum(axis=1)
+    squares = squares[squares > 0.0]
+    return float(0.5 * np.log(squares).mean()) if squares.size else -np.inf
+
+
+# -- observer -------------------------------------------------------------------------------------
+
+
+STEP = 0.25
+"""Interval of the observations, s."""
+HORIZONS = (1.0, 2.0, 5.0, 10.0)
+"""s; multiples of :data:`STEP`"""
+CLIMATOLOGY = 'climatology'
+KNOWN = 0.25
+"""Error below which a place is known, m."""
+
+_LAGS = ((0, 1, 2, 4), (0, 1, 2, 4, 8, 12, 16), (0, 1, 2, 4, 8, 12, 16, 24, 32, 40, 48))
+"""Past of the delay vectors, in steps: 1, 4 and 12 s."""
+_MOST = 1200
+"""Most examples of the kernel, whose cost grows with their cube: all of ten minutes."""
+_TRAINING = 2.0 / 3.0
+"""Share of the first half that is learnt from when settings are chosen."""
+
+
+class Skill(NamedTuple):
+    """Skill at one horizon: 1 exact, 0 as good as the mean position of the first half."""
+
+    horizon: float
+    """s"""
+    best: float
+    """That of the best predictor, at least 0: climatology is one of them."""
+    predictor: str
+    """Its name."""
+    error: float
+    """Root mean square error of the best predictor, m. Unlike the skill it does not depend on how
+    far the path spreads: of two paths that surprise equally, the one that covers more of the room
+    has the higher skill."""
+    median: float
+    """Median error of it, m."""
+    known: float
+    """Share of the moments at which its error is below :data:`KNOWN`."""
+
+
+def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
+    r"""Return the skill of the observer at each of :data:`HORIZONS`.
+
+    With the mean position m of the first half, over the second half:
+
+    .. math:: s(h) = 1 - \frac{\sum_n |\hat p_n(h) - p(t_n + h)|^2}{\sum_n |m - p(t_n + h)|^2}
+
+    Times (s) and positions (m), shape (n,), are sampled again every :data:`STEP` seconds. Raises
+    ValueError for a path that is too short: each half must last 24 s and three of the longest
+    horizon.
+    """
+    path = resampled(t, x, y, STEP)
+    steps = np.array([round(horizon / STEP) for horizon in HORIZONS], dtype=np.int64)
+    half, longest = len(path) // 2, int(steps.max())
+    least = max(2 * _LAGS[-1][-1], 3 * longest)
+    if half < least:
+        raise ValueError(
+            f'the path must last at least {2 * least * STEP:g} s for horizons up to '
+            f'{max(HORIZONS):g} s: got {len(path) * STEP:g} s'
+        )
+    origins = np.arange(half, len(path) - longest)
+    target = _positions(path, origins, steps)
+    climatology = _square_errors(path[:half].mean(axis=0), target)
+    if climatology.min() <= 0.0:  # a robot that stands where it stood
+        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0, 0.0, 1.0) for h in HORIZONS)
+    skills = {CLIMATOLOGY: np.zeros(steps.size)}
+    errors = {CLIMATOLOGY: np.hypot(*(path[:half].mean(axis=0) - target).transpose(2, 0, 1))}
+    for name, predict in _PREDICTORS.items():
+        found = predict(path, half, origins, steps)
+        skills[name] = 1.0 - _square_errors(found, target) / climatology
+        errors[name] = np.hypot(*(found - target).transpose(2, 0, 1))
+    best = []
+    for row, horizon in enumerate(HORIZONS):
+        reached = {name: float(each[row]) for name, each in skills.items()}
+        name = max(reached, key=reached.__getitem__)
+        skill = reached[name]
+        error = math.sqrt((1.0 - skill) * climatology[row])
+        known = float((errors[name][row] < KNOWN).mean())
+        median = float(np.median(errors[name][row]))
+        best.append(Skill(horizon, skill, name, error, median, known))
+    return tuple(best)
+
+
+Rows = NDArray[np.int64]
+Predictor = Callable[[Array, int, Rows, Rows], Array]
+"""Returns the positions some steps after some origins, shape (steps, origins, 2), m, given the
+path up to each origin for its input, and the first ``half`` samples to learn from."""
+
+
+def _positions(path: Array, origins: Rows, steps: Rows) -> Array:
+    found: Array = path[origins[None, :] + steps[:, None]]
+    return found
+
+
+def _square_errors(estimate: Array, target: Array) -> Array:
+    """Return the mean square error of each step, shape (steps,)."""
+    errors: Array = ((estimate - target) ** 2).sum(axis=2).mean(axis=1)
+    return errors
+
+
+def _persistence(path: Array, half: int, origins: Rows, steps: Rows) -> Array:
+    return np.repeat(path[None, origins], steps.size, axis=0)
+
+
+def _constant_velocity(path: Array, half: int, origins: Rows, steps: Rows) -> Array:
+    moved = path[origins] - path[origins - 1]
+    return path[None, origins] + steps[:, None, None] * moved[None]
+
+
+def _constant_turn(path: Array, half: int, origins: Rows, steps: Rows) -> Array:
+    """Continue the last two displacements as an arc, whose chords turn by equal angles."""
+    moved = np.diff(path, axis=0) @ np.array([1.0, 1.0j])
+    last, before = moved[origins - 1], moved[origins - 2]
+    turn = np.angle(last * before.conj())  # zero at rest
+    ahead = np.cumsum(np.exp(1j * turn[None, :] * np.arange(1, steps.max() + 1)[:, None]), axis=0)
+    reached = last[None, :] * ahead[steps - 1]
+    found: Array = path[None, origins] + np.stack([reached.real, reached.imag], axis=2)
+    return found
+
+
+class _Examples(NamedTuple):
+    """Delay vectors and the displacements that followed each."""
+
+    inputs: Array
+    """Shape (n, d), standardised."""
+    outputs: Array
+    """m, shape (n, 2 * steps)."""
+
+
+Fit = Callable[[_Examples, Array], Array]
+"""Returns the displacements that follow some inputs, shape (n, 2 * steps), learnt from
+the examples."""
+
+
+def _inputs(path: Array, lags: Sequence[int], origins: Rows, half: int) -> Array:
+    """Return position and past displacements, each in its spread over the first half."""
+    rows = delay_vectors(path, lags)
+    rows = np.hstack([rows[:, :2], rows[:, :-2] - rows[:, 2:]])
+    learnt = rows[: half - lags[-1]]
+    spread = learnt.std(axis=0)
+    spread[spread < 1e-9] = 1.0
+    scaled: Array = (rows[origins - lags[-1]] - learnt.mean(axis=0)) / spread
+    return scaled
+
+
+def _examples(path: Array, lags: Sequence[int], end: int, half: int, steps: Rows) -> _Examples:
+    """Return the examples whose outcomes are before sample ``end``."""
+    origins = np.arange(lags[-1], end - steps.max())
+    outcome = _positions(path, origins, steps) - path[None, origins]
+    return _Examples(
+        _inputs(path, lags, origins, half),
+        outcome.transpose(1, 0, 2).reshape(origins.size, 2 * steps.size),
+    )
+
+
+def _fit_linear(examples: _Examples, inputs: Array, ridge: float) -> Array:
+    rows = np.hstack([examples.inputs, np.ones((len(examples.inputs), 1))])
+    normal = rows.T @ rows + ridge * len(rows) * np.eye(rows.shape[1])
+    weights = np.linalg.solve(normal, rows.T @ examples.outputs)
+    found: Array = np.hstack([inputs, np.ones((len(inputs), 1))]) @ weights
+    return found
+
+
+def _fit_analogues(examples: _Examples, inputs: Array, neighbours: int) -> Array:
+    count = min(neighbours, len(examples.inputs))
+    squares = square_distances(inputs, examples.inputs)
+    nearest = np.argpartition(squares, count - 1, axis=1)[:, :count]
+    weights = 1.0 / (np.take_along_axis(squares, nearest, axis=1) + 1e-6)
+    weights /= weights.sum(axis=1, keepdims=True)
+    found: Array = (weights[:, :, None] * examples.outputs[nearest]).sum(axis=1)
+    return found
+
+
+def _fit_kernel(examples: _Examples, inputs: Array, width: float, ridge: float) -> Array:
+    every = -(-len(examples.inputs) // _MOST)
+    examples = _Examples(examples.inputs[::every], examples.outputs[::every])
+    squares = square_distances(examples.inputs, examples.inputs)
+    scale = 2.0 * width**2 * float(np.median(squares)) + 1e-12
+    gram = np.exp(-squares / scale)
+    gram[np.diag_indices_from(gram)] += ridge
+    weights = np.linalg.solve(gram, examples.outputs)
+    found: Array = np.exp(-square_distances(inputs, examples.inputs) / scale) @ weights
+    return found
+
+
+_SETTINGS: dict[str, list[tuple[Sequence[int], Fit]]] = {
+    'linear': [
+        (lags, partial(_fit_linear, ridge=ridge))
+        for lags in _LAGS
+        for ridge in (1e-6, 1e-3, 1e-1, 1e1)
+    ],
+    'analogues': [
+        (lags, partial(_fit_analogues, neighbours=neighbours))
+        for lags in _LAGS
+        for neighbours in (1, 5, 20)
+    ],
+    'kernel': [
+        (lags, partial(_fit_kernel, width=width, ridge=ridge))
+        for lags in _LAGS[:2]
+        for width, ridge in ((0.5, 1e-2), (1.0, 1e-3), (1.0, 1e-1))
+    ],
+}
+"""Delay vectors and fit of each setting; widths in median distances."""
+
+
+def _learnt(name: str, path: Array, half: int, origins: Rows, steps: Rows) -> Array:
+    """Return the predictions, for each step with the setting that its last third prefers."""
+
+    def predicted(setting: tuple[Sequence[int], Fit], end: int, rows: Rows) -> Array:
+        lags, fit = setting
+        moved = fit(_examples(path, lags, end, half, steps), _inputs(path, lags, rows, half))
+        found: Array = moved.reshape(rows.size, steps.size, 2).transpose(1, 0, 2)
+        return path[None, rows] + found
+
+    split = round(_TRAINING * half)
+    checked = np.arange(split, half - steps.max())
+    target = _positions(path, checked, steps)
+    settings = _SETTINGS[name]
+    errors = np.array(
+        [_square_errors(predicted(each, split, checked), target) for each in settings]
+    )
+    chosen = errors.argmin(axis=0)
+    answers = {row: predicted(settings[row], half, origins) for row in set(chosen.tolist())}
+    return np.stack([answers[row][step] for step, row in enumerate(chosen.tolist())])
+
+
+_PREDICTORS: dict[str, Predictor] = {
+    'persistence': _persistence,
+    'constant velocity': _constant_velocity,
+    'constant turn': _constant_turn,
+    **{name: partial(_learnt, name) for name in _SETTINGS},
+}
+
+
+# -- coverage, and all figures --------------------------------------------------------------------
+
 
 SHARES = (0.5, 0.9, 0.95)
 """Shares of the grid whose times are measured."""

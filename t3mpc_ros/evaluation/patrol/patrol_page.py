@@ -38,9 +38,8 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     PatrolPlan,
     PatrolStudy,
 )
-from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
+from t3mpc_ros.evaluation.patrol.patrol_metrics import HORIZONS, SHARES
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.simulation.world import World
 from t3mpc_ros.version import VERSION
 

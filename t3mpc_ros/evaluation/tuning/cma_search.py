@@ -34,7 +34,7 @@ import cma
 import numpy as np
 
 from t3mpc_ros.evaluation.experiment import ResultFile
-from t3mpc_ros.evaluation.tuning.search_space import SearchSpace, Values
+from t3mpc_ros.evaluation.tuning.tuned_parameters import SearchSpace, Values
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters
 

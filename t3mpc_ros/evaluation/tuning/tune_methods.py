@@ -39,17 +39,15 @@ from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import START, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import search_best
-from t3mpc_ros.evaluation.tuning.search_space import (
+from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+    SMOOTHNESS,
     MethodDefinition,
     SearchRange,
-    Values,
-)
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
-    SMOOTHNESS,
     StoreError,
     TunedEntry,
     TunedParameters,
     TuningBudget,
+    Values,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 from t3mpc_ros.version import VERSION
