@@ -69,10 +69,9 @@ def add_parser(commands: shared_options.Commands) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the tables."""
-    from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison
     from t3mpc_ros.evaluation.api.result_tables import writable
-    from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
+    from t3mpc_ros.evaluation.comparison import markdown, page, record, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.result_output import columns_of, write_columns
 
@@ -83,10 +82,10 @@ def run(options: argparse.Namespace) -> None:
     shared_options.print_result(
         options,
         lambda: markdown(plan, results, times),
-        lambda: comparison_page.record(plan, results, times),
+        lambda: record(plan, results, times),
     )
     if options.html:
-        write_atomically(options.html, comparison_page.page(plan, results, times))
+        write_atomically(options.html, page(plan, results, times))
     if options.csv:
         write_columns(writable(options.csv), columns_of(Comparison(plan, results).rows()))
 

@@ -38,7 +38,7 @@ def add_parser(commands: shared_options.Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the outcome of each fault; return 0 when every loop stayed bounded, else 1."""
-    from t3mpc_ros.evaluation import fault_page
+    from t3mpc_ros.evaluation import fault_outcomes
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.fault_outcomes import FAULT_RUNS, study_faults
 
@@ -55,9 +55,11 @@ def run(options: argparse.Namespace) -> int:
     ]
     with shared_options.executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
-    shared_options.print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
+    shared_options.print_result(
+        options, lambda: fault_outcomes.console_text(rows), lambda: list(rows)
+    )
     if options.output:
-        fault_page.update_page(options.output, rows)
+        fault_outcomes.update_page(options.output, rows)
     if options.html:
-        write_atomically(options.html, fault_page.page(rows))
+        write_atomically(options.html, fault_outcomes.page(rows))
     return 1 if any(row['verdict'] == 'unbounded' for row in rows) else 0

@@ -95,7 +95,7 @@ def graph(**answers):
 def studied(*verdicts):
     return {
         'evaluation.fault_outcomes.study_faults': [{'verdict': v} for v in verdicts],
-        'evaluation.fault_page.console_text': '',
+        'evaluation.fault_outcomes.console_text': '',
     }
 
 

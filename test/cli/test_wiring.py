@@ -148,8 +148,8 @@ COMPARE = {
     'evaluation.comparison.run_plan': {},
     'evaluation.comparison.step_times': {},
     'evaluation.comparison.markdown': '',
-    'evaluation.comparison_page.record': {},
-    'evaluation.comparison_page.page': '',
+    'evaluation.comparison.record': {},
+    'evaluation.comparison.page': '',
     'evaluation.method_table.require_libraries': None,
 }
 PATROL = {
@@ -196,9 +196,9 @@ OF_BAGS = {
 }
 FAULTS = {
     'evaluation.fault_outcomes.study_faults': [],
-    'evaluation.fault_page.console_text': '',
-    'evaluation.fault_page.update_page': None,
-    'evaluation.fault_page.page': '',
+    'evaluation.fault_outcomes.console_text': '',
+    'evaluation.fault_outcomes.update_page': None,
+    'evaluation.fault_outcomes.page': '',
 }
 REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
 OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)

@@ -45,12 +45,13 @@ from t3mpc_ros.evaluation.comparison import (
     ComparisonPlan,
     case_table,
     first_verdicts,
+    front,
+    record,
     run_plan,
     step_times,
     summary_table,
     verdicts,
 )
-from t3mpc_ros.evaluation.comparison_page import front, record
 from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, paired
 from t3mpc_ros.evaluation.loop import MethodDriver, MethodSpec, NodeMethod, ReportLink, run
 from t3mpc_ros.evaluation.method_table import (

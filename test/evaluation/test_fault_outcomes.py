@@ -24,7 +24,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation import fault_outcomes, fault_page
+from t3mpc_ros.evaluation import fault_outcomes
 from t3mpc_ros.evaluation.loop import NodeMethod, run
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario, noisy_twin, sampled_speeds
 from t3mpc_ros.parameters.table import ParameterError
@@ -53,14 +53,18 @@ def fault_run(course, name):
 
 def row_text(result):
     """Return the row of the page's table."""
-    return f'| {" | ".join(fault_page.table_row(result))} |\n'
+    return f'| {" | ".join(fault_outcomes.table_row(result))} |\n'
 
 
 def page_rows():
     """Return the rows of the page's outcome tables by (course, fault)."""
-    text = PAGE.read_text().partition(fault_page.BEGIN_MARK)[2].partition(fault_page.END_MARK)[0]
+    text = (
+        PAGE.read_text()
+        .partition(fault_outcomes.BEGIN_MARK)[2]
+        .partition(fault_outcomes.END_MARK)[0]
+    )
     rows = {}
-    for course, title in fault_page.TITLES.items():
+    for course, title in fault_outcomes.TITLES.items():
         part = text.partition(f'### {title}\n')[2].partition('###')[0]
         for line in part.splitlines():
             if line.startswith('| `'):
@@ -165,8 +169,10 @@ def test_undetected_faults_are_named(course, name):
     assert not result['detected']
     assert 'odometry is wrong' in result['undetected']
     line = row_text(result)
-    assert (fault_page.UNREPORTED if 'collision' in name else fault_page.UNDETECTED) in line
-    assert 'not detected' in fault_page.console_text([result])
+    assert (
+        fault_outcomes.UNREPORTED if 'collision' in name else fault_outcomes.UNDETECTED
+    ) in line
+    assert 'not detected' in fault_outcomes.console_text([result])
     assert_same(line, page_rows()[course, name])
 
 
@@ -176,7 +182,10 @@ def test_the_page_has_a_row_for_every_trial_and_no_other():
     assert names >= {*FAULTS}
     assert {line.count('|') for line in page_rows().values()} == {7}
     assert (
-        fault_page.page_section([]).partition('\n###')[0].split(fault_page.END_MARK)[0].strip()
+        fault_outcomes.page_section([])
+        .partition('\n###')[0]
+        .split(fault_outcomes.END_MARK)[0]
+        .strip()
         in PAGE.read_text()
     )
 
@@ -206,7 +215,7 @@ def test_a_run_without_fault_is_bounded_and_notices_nothing():
     found = [result[name] for name in ('verdict', 'recovery_time', 'detected', 'undetected')]
     assert found == ['bounded', 0.0, [], []]
     result |= {'name': AT.name, 'course': 'arc'}
-    lines = fault_page.markdown_tables([result, {**result, 'course': 'chaotic'}]).splitlines()
+    lines = fault_outcomes.markdown_tables([result, {**result, 'course': 'chaotic'}]).splitlines()
     assert {line.count('|') for line in lines if line.startswith('|')} == {7}
 
 
@@ -254,7 +263,9 @@ def two(monkeypatch):
 @pytest.mark.long
 def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
-    page.write_text(f'before\n{fault_page.BEGIN_MARK}\nold\n{fault_page.END_MARK}\nafter\n')
+    page.write_text(
+        f'before\n{fault_outcomes.BEGIN_MARK}\nold\n{fault_outcomes.END_MARK}\nafter\n'
+    )
     html = tmp_path / 'faults.html'
     files = ['--output', str(page), '--json', str(numbers), '--html', str(html)]
     assert main(['faults', '--workers', '1', *files]) == 0
@@ -262,8 +273,8 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert 'gyro_dead' in shown.out
     assert '2/2 [' in shown.err
     text = page.read_text()
-    assert text.startswith(f'before\n{fault_page.BEGIN_MARK}\n')
-    assert text.endswith(f'{fault_page.END_MARK}\nafter\n')
+    assert text.startswith(f'before\n{fault_outcomes.BEGIN_MARK}\n')
+    assert text.endswith(f'{fault_outcomes.END_MARK}\nafter\n')
     assert 'old' not in text
     assert text.count('| `gyro_dead` |') == 2
     shown = html.read_text(encoding='utf-8')
@@ -276,14 +287,14 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     'text',
     [
         '',
-        fault_page.BEGIN_MARK,
-        f'{fault_page.END_MARK}{fault_page.BEGIN_MARK}',
-        2 * fault_page.BEGIN_MARK,
+        fault_outcomes.BEGIN_MARK,
+        f'{fault_outcomes.END_MARK}{fault_outcomes.BEGIN_MARK}',
+        2 * fault_outcomes.BEGIN_MARK,
     ],
 )
 def test_a_page_without_the_marks_is_left_alone(text, tmp_path):
     page = tmp_path / 'page.md'
     page.write_text(text)
     with pytest.raises(ValueError, match='must hold the lines'):
-        fault_page.update_page(page, [])
+        fault_outcomes.update_page(page, [])
     assert page.read_text() == text

@@ -29,7 +29,7 @@ import pytest
 from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation import comparison_page, fault_page, figure_style
+from t3mpc_ros.evaluation import comparison, fault_outcomes, figure_style
 from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution
 from t3mpc_ros.evaluation.api.parameter_sweep import Sweep
 from t3mpc_ros.evaluation.api.single_run import RunResult
@@ -393,8 +393,7 @@ def caught(monkeypatch):
         if (figure := draw(subject)) is not None:
             figures.append(figure)
 
-    for module in (comparison_page, fault_page, figure_style):
-        monkeypatch.setattr(module, 'drawing', instead)
+    monkeypatch.setattr(figure_style, 'drawing', instead)
     return figures
 
 
@@ -413,7 +412,7 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     results = ResultTable(rows)
     found = first_verdicts(plan, results)  # of the first metric: the other one never differs
     assert [found[name, 'nominal'] for name in apart] == ['better', 'worse', 'inconclusive']
-    page = comparison_page.page(plan, results)
+    page = comparison.page(plan, results)
     (axis,) = caught[0].axes
     assert [tick.get_text() for tick in axis.get_yticklabels()] == [*apart]
     for container, (name, shift), colour, verdict in zip(
@@ -426,7 +425,7 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
         assert to_hex(container.lines[0].get_color()) == colour
         value = f'{1.0 + shift + np.mean(noise):.4f}'
         assert re.search(rf'{value} ±[^"]*{verdict}', page)
-        stored = comparison_page.record(plan, results)['cases']['nominal']['methods'][name]
+        stored = comparison.record(plan, results)['cases']['nominal']['methods'][name]
         assert stored['difference_from_feed_forward']['settled']['verdict'] == verdict
     assert axis.get_xlabel() == 'settled / (rad/s)'
 
@@ -440,7 +439,7 @@ OUTCOME = {
 
 def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     other = OUTCOME | {'name': 'brown_out', 'before': 0.3, 'during': 0.9, 'after': None}
-    page = fault_page.page([OUTCOME, other])
+    page = fault_outcomes.page([OUTCOME, other])
     (axis,) = caught[0].axes
     shown = lines(axis)
     errors = {'before': [0.1, 0.3], 'during': [0.7, 0.9], 'after': [0.2]}
@@ -451,13 +450,15 @@ def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     assert 'Every fault stays bounded' in page
     assert '2 stay within the limits and recover.' in page
     lost = {'undetected': ['odometry is wrong'], 'odometry_after': [1.03, 0.5]}
-    astray = fault_page.page([OUTCOME, other | lost])
+    astray = fault_outcomes.page([OUTCOME, other | lost])
     assert (
         '<div class="verdict open"><p class="headline">Every fault stays within the limits, but '
         'the odometry is wrong at the end of 1 of 2 runs, by up to 1.03 m, 28.6° (brown_out, '
         in astray
     ), 'it was green: every fault stays bounded'
-    worse = fault_page.page([OUTCOME, other | {'verdict': 'unbounded', 'undetected': ['tilt']}])
+    worse = fault_outcomes.page(
+        [OUTCOME, other | {'verdict': 'unbounded', 'undetected': ['tilt']}]
+    )
     assert 'Not every fault stays bounded' in worse
     assert '1 exceed a limit.' in worse
 

@@ -34,7 +34,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults, cases_for
-from t3mpc_ros.evaluation.comparison_page import draw_seeds, record
+from t3mpc_ros.evaluation.comparison import draw_seeds, record
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import (
     MethodDriver,

@@ -84,10 +84,8 @@ class Comparison(ShownAsTables):
 
         By default that of the first case; written to ``path``, a .png, .pdf or .svg, if given.
         """
-        from t3mpc_ros.evaluation.comparison_page import draw_seeds
-
         (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
-        return drawn(lambda _: draw_seeds(self.plan, self.results, chosen), path)
+        return drawn(lambda _: comparison.draw_seeds(self.plan, self.results, chosen), path)
 
     @one_sentence
     def values(self, controller: Any, metric: str = SETTLED.name, case: str = '') -> list[float]:
@@ -122,10 +120,8 @@ class Comparison(ShownAsTables):
     @one_sentence
     def to_html(self, path: str | os.PathLike[str]) -> Path:
         """Write tables and figures as one page and return the path."""
-        from t3mpc_ros.evaluation.comparison_page import page
-
         target = writable(path, '.html')
-        write_atomically(target, page(self.plan, self.results))
+        write_atomically(target, comparison.page(self.plan, self.results))
         return target
 
 

@@ -31,11 +31,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from t3mpc_ros.control.jump_transition import (
-    JumpTransition,
-    JumpTransitionParameters,
-    MotorLimit,
-)
+from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters, MotorLimit
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters

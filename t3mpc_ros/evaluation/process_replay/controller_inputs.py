@@ -27,11 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import TopicColumns, read_columns
-from t3mpc_ros.bag.controller_input_journal import (
-    COMMAND_EVENTS,
-    Event,
-    parameters_from_json,
-)
+from t3mpc_ros.bag.controller_input_journal import COMMAND_EVENTS, Event, parameters_from_json
 from t3mpc_ros.bag.message_losses import message_loss_notes
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters

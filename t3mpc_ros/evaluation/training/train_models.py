@@ -28,10 +28,7 @@ from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
 from t3mpc_ros.evaluation.experiment import Job, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.loop import MethodSpec, pretrain, run
 from t3mpc_ros.evaluation.method_table import FULL, methods
-from t3mpc_ros.evaluation.proposed_method import (
-    ProposedController,
-    ProposedParameters,
-)
+from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.evaluation.scenario import (

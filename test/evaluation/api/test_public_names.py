@@ -40,7 +40,7 @@ def test_the_import_loads_no_library():
     assert json.loads(done.stdout) == []
 
 
-STUDIES = ('paper.reproduce', 'tuning.tune_methods', 'comparison_page', 'patrol.patrol_comparison')
+STUDIES = ('paper.reproduce', 'tuning.tune_methods', 'comparison', 'patrol.patrol_comparison')
 
 
 @pytest.mark.long
