@@ -137,10 +137,9 @@ def _print_table(
 
 
 def _tune_tracking(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.patrol import path_tracker_comparison, path_tracker_page
+    from t3mpc_ros.evaluation.patrol import path_tracker_comparison as study
 
-    tune, markdown = path_tracker_comparison.tune_trackers, path_tracker_page.tuning_markdown
-    return _print_table(options, tune, markdown, lambda found: found)
+    return _print_table(options, study.tune_trackers, study.tuning_markdown, lambda found: found)
 
 
 def _safety(options: argparse.Namespace) -> int:
@@ -161,27 +160,26 @@ def _compare_localizations(options: argparse.Namespace) -> int:
 
 
 _Study = tuple[Any, Any, Callable[..., Any]]
-"""Module of the page, plan, and the function that measures it."""
+"""Module of the study, plan, and the function that measures it."""
 
 
 def _tracking(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import path_tracker_comparison, path_tracker_page
+    from t3mpc_ros.evaluation.patrol import path_tracker_comparison as study
 
-    paths = options.paths or tuple(path_tracker_comparison.TRACKED_PATHS)
-    plan = path_tracker_comparison.TrackingPlan(paths=paths, seeds=options.seeds)
-    return path_tracker_page, plan, path_tracker_comparison.compare_trackers
+    paths = options.paths or tuple(study.TRACKED_PATHS)
+    plan = study.TrackingPlan(paths=paths, seeds=options.seeds)
+    return study, plan, study.compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import patrol_page
-    from t3mpc_ros.evaluation.patrol.patrol_comparison import PATHS, PatrolPlan, compare_patrols
+    from t3mpc_ros.evaluation.patrol import patrol_comparison as study
 
-    plan = PatrolPlan(
-        paths=options.paths or PATHS,
+    plan = study.PatrolPlan(
+        paths=options.paths or study.PATHS,
         seeds=options.seeds,
         duration=60.0 * options.minutes,
         robot='twin' if options.planned else options.robot,
         planned=options.planned,
         arena=tuple(options.arena),
     )
-    return patrol_page, plan, compare_patrols
+    return study, plan, study.compare_patrols

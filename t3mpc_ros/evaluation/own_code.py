@@ -223,9 +223,8 @@ def digest(*parts: Any) -> str:
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'model_file.py',
     'evaluation/bag_report/', 'evaluation/process_replay/', 'evaluation/comparison',
-    'evaluation/fault_outcomes.py', 'evaluation/html_page.py', 'evaluation/figure_style.py',
-    'evaluation/result_output.py', 'evaluation/paper/', 'evaluation/patrol/patrol_page.py',
-    'evaluation/patrol/path_tracker_page.py',
+    'evaluation/html_page.py', 'evaluation/figure_style.py', 'evaluation/result_output.py',
+    'evaluation/paper/',
 )  # fmt: skip
 
 

@@ -153,7 +153,7 @@ COMPARE = {
     'evaluation.method_table.require_libraries': None,
 }
 PATROL = {
-    f'evaluation.patrol.{name}_page.{function}': result
+    f'evaluation.patrol.{name}_comparison.{function}': result
     for name in ('patrol', 'path_tracker')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
@@ -167,7 +167,7 @@ PATROL = {
     'evaluation.patrol.path_tracker_comparison.tune_trackers': {},
     'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
-    'evaluation.patrol.path_tracker_page.tuning_markdown': '',
+    'evaluation.patrol.path_tracker_comparison.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.method_table import FULL, methods_for
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.paper_figures import FigureRuns
 from t3mpc_ros.evaluation.paper.paper_study import STAGES, WITHOUT, Results
-from t3mpc_ros.evaluation.patrol import path_tracker_page, patrol_page
+from t3mpc_ros.evaluation.patrol import path_tracker_comparison, patrol_comparison
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import OURS as TRACKER
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     TRACKED_PATHS,
@@ -481,7 +481,7 @@ PATROLS = PatrolStudy(
 
 
 def test_coverage_is_the_mean_in_per_cent_over_minutes():
-    (axis,) = patrol_page.draw_coverage(PATROLS).axes
+    (axis,) = patrol_comparison.draw_coverage(PATROLS).axes
     shown = lines(axis)
     for name, last in ((OURS, 80.0), ('random walk', 50.0)):
         time, share = shown[name]
@@ -491,7 +491,7 @@ def test_coverage_is_the_mean_in_per_cent_over_minutes():
 
 
 def test_skills_have_their_intervals():
-    (axis,) = patrol_page.draw_predictability(PATROLS).axes
+    (axis,) = patrol_comparison.draw_predictability(PATROLS).axes
     for name, container in zip(PATROLS.plan.paths, axis.containers, strict=True):
         assert container.get_label() == name
         values = [PATROLS.table.values(f'skill_{h:g}', controller=name) for h in HORIZONS]
@@ -555,7 +555,7 @@ DRAWN = PatrolStudy(
 
 def test_heat_maps_are_where_the_robot_was():
     """Between the walls and axes of the room: the picture of an array begins at the top."""
-    *axes, bar = patrol_page.draw_heat_maps(DRAWN).axes
+    *axes, bar = patrol_comparison.draw_heat_maps(DRAWN).axes
     for axis, row, place in zip(axes, DRAWN.table, ((0.25, 0.25), (2.75, 0.75)), strict=True):
         assert title(axis) == row['controller']
         even = 4.0 / 31  # s in each of the cells that count
@@ -577,7 +577,7 @@ def test_heat_maps_are_where_the_robot_was():
 
 
 def test_patrols_are_drawn_with_their_hits_and_the_room():
-    for axis, row in zip(patrol_page.draw_paths(DRAWN).axes, DRAWN.table, strict=True):
+    for axis, row in zip(patrol_comparison.draw_paths(DRAWN).axes, DRAWN.table, strict=True):
         assert title(axis) == row['controller']
         hits, path = axis.lines
         assert hits.get_xydata() == pytest.approx(np.array(row['hits']))
@@ -613,7 +613,7 @@ def test_tracked_paths_have_the_drives_of_their_methods():
          for (path, method), track in tracks.items()]
     )  # fmt: skip
     study = TrackingStudy(TrackingPlan(paths, (1,), methods), table)
-    first, second, *empty = path_tracker_page.draw_tracks(study).axes
+    first, second, *empty = path_tracker_comparison.draw_tracks(study).axes
     for axis, path in zip((first, second), paths, strict=True):
         shown = lines(axis)
         assert shown.keys() == colours.keys()

@@ -25,7 +25,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.patrol import path_tracker_page
+from t3mpc_ros.evaluation.patrol import path_tracker_comparison
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (
     METHODS,
     OURS,
@@ -203,7 +203,7 @@ def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
     ]  # fmt: skip
     plan = TrackingPlan(('square',), (0, 1, 2), tuple(times))
     study = TrackingStudy(plan, ResultTable(rows))
-    text = path_tracker_page.path_table(study, 'square').markdown()
+    text = path_tracker_comparison.path_table(study, 'square').markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))
     assert row.endswith(f'| {verdict} |')
     assert 'arrived in 0 of 3' in row

@@ -23,7 +23,7 @@ from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.patrol import patrol_comparison, patrol_page
+from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid
 from t3mpc_ros.geometry.path_timing import MotionLimits
 from t3mpc_ros.simulation.world import clearance, load_world
@@ -64,7 +64,7 @@ def judged(duration=1300.0, **rows):
             for seed, values in enumerate(zip(*seeds, strict=True), 1)
         ]
     )
-    return patrol_page.claims(
+    return patrol_comparison.claims(
         patrol_comparison.PatrolStudy(
             patrol_comparison.PatrolPlan(seeds=(1, 2, 3), duration=duration), table
         )

@@ -24,9 +24,14 @@ from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.paper.paper_study import Results, estimation
-from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
+from t3mpc_ros.evaluation.patrol.patrol_comparison import (
+    OURS,
+    PatrolPlan,
+    PatrolStudy,
+    coverage_table,
+    surprise_table,
+)
 from t3mpc_ros.evaluation.patrol.patrol_metrics import HORIZONS, SHARES
-from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,
     FieldComparison,
