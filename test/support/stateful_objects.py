@@ -979,7 +979,9 @@ CONFIGURED = {
         BODY_PARAMETERS, make_body, configure, drive_body, elsewhere=('enabled',)
     ),
     Controller: Configured(
-        ControllerParameters.from_dict({'fuzzy.sets': 3, 'friction.gamma': 5.0}),
+        ControllerParameters.from_dict(
+            {'fuzzy.sets': 3, 'friction.gamma': 5.0, 'command_shaper.straight_frequency': 14.6}
+        ),
         Controller,
         configure,
         drive_controller,
