@@ -49,8 +49,10 @@ def _own_robot(module, folder):
 
 
 def _own_plant(module, folder):
-    runs = module.main(folder, 6.0)
-    assert runs['rigid', 'full'].rmse(2.0) < runs['flexible', 'full'].rmse(2.0)
+    """Flexible shafts ring after switches; in 6 s without one, noise alone decided."""
+    runs = module.main(folder, 20.0)
+    rigid, flexible = (runs[name, 'full'].metrics['settled'] for name in ('rigid', 'flexible'))
+    assert rigid < 0.5 * flexible
 
 
 def _own_noise(module, folder):
