@@ -365,7 +365,8 @@ def test_the_main_figures(reported):
         both(f'variation of the {title} per second', values, 'rad/s')
     expected['duration'] = f'{shown(bag.duration)} s'
     expected['messages'] = str(sum(bag.counts.values()))
-    expected['switches'] = str(len(switches_of(bag)))
+    if '/reference/signals' in bag.time:  # else it is not known which jumps are switches
+        expected['switches'] = str(len(switches_of(bag)))
     stood = sum(end - start for start, end in stops_of(bag, measured))
     expected['stood although it was to move'] = f'{shown(float(stood))} s'
     received = bag.received[ODOM]
