@@ -1176,9 +1176,13 @@ def hold_newest(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
 
 
 def _command_limits(parameters: ControllerParameters) -> LimitParameters:
-    """Return the limits of the commands, without a deadband where no rotor oscillates."""
-    oscillates = any(parameters.command_shaper.delays)
-    return parameters.limits if oscillates else replace(parameters.limits, deadband=0.0)
+    """Return the limits of the commands; no deadband where no rotor oscillates, or on a path.
+
+    The pose loop keeps to a path within less than what a deadband leaves behind.
+    """
+    if any(parameters.command_shaper.delays) and not parameters.pose.enabled:
+        return parameters.limits
+    return replace(parameters.limits, deadband=0.0)
 
 
 def _largest(limits: LimitParameters) -> BodyTwist:

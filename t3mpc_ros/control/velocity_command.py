@@ -110,8 +110,9 @@ class LimitParameters(Parameters):
     deadband: float = parameter(
         0.055,
         'wheel speed below which stop or this speed is commanded, in turns with the right mean, '
-        'where commands are shaped: pulses of a stepper at half of this speed meet the frequency '
-        'of its rotor. At most a tenth of wheel.max_velocity acts; 0: none',
+        'where commands are shaped and no path is followed: pulses of a stepper at half of this '
+        'speed meet the frequency of its rotor. At most a tenth of wheel.max_velocity acts; '
+        '0: none',
         'rad/s',
         (0.0, 0.1),
         name='wheel.deadband_velocity',
