@@ -289,7 +289,7 @@ class Controller:
         self._period_ns = round(self._period * NANOSECONDS)
         self.actuation = VelocityActuation(
             parameters.speed_filter,
-            _command_limits(parameters),
+            _limits_in_use(parameters),
             parameters.geometry,
             'velocity',
             self._period,
@@ -449,7 +449,7 @@ class Controller:
         self._tracker.configure(parameters.resolved())
         self.body.configure(parameters.body)
         self.pose_controller.parameters = parameters.pose
-        self.actuation.configure(_command_limits(parameters))
+        self.actuation.configure(_limits_in_use(parameters))
         self._tracker.transition.limit = _command_limit(parameters)
         self._trajectory.set_jump(_least_jump(parameters.limits))
         if self.keep_out is not None:
@@ -1175,7 +1175,7 @@ def hold_newest(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
     return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
 
 
-def _command_limits(parameters: ControllerParameters) -> LimitParameters:
+def _limits_in_use(parameters: ControllerParameters) -> LimitParameters:
     """Return the limits of the commands; no deadband where no rotor oscillates, or on a path.
 
     The pose loop keeps to a path within less than what a deadband leaves behind.

@@ -140,7 +140,7 @@ class Deadband:
     def step(self, wanted: float, elapsed: float) -> float:
         """Return the speed (rad/s) to command for ``elapsed`` s in place of the wanted one."""
         rate = abs(wanted - self._wanted) / elapsed
-        if wanted == 0.0 or abs(wanted) >= self.speed or rate > FAST:
+        if not 0.0 < abs(wanted) < self.speed or rate > FAST:  # or it is not a number
             self.reset(wanted)
             return wanted
         self._wanted = wanted

@@ -219,6 +219,14 @@ def test_a_wheel_that_is_to_stand_makes_up_for_nothing():
         assert commands[-1] == pytest.approx(then)
 
 
+def test_a_deadband_hides_no_command_that_is_not_a_number():
+    """It made 0 of it: the robot stood, and nothing said why."""
+    drive = _drive(LimitParameters())
+    drive.observe(np.zeros(2), T)
+    drive.send_acceleration(np.array([math.nan, 1.0]))
+    assert np.isnan(drive.command).all()
+
+
 def test_a_deadband_is_at_most_a_tenth_of_the_largest_speed():
     """A robot whose wheels may turn at 0.2 rad/s at most still moves slowly."""
     commands = _commands(LimitParameters(wheel_speed=0.2), [(0.021, 0.021)] * 50)
