@@ -21,6 +21,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 import re
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import yaml
@@ -415,6 +416,17 @@ def _flat(tree: dict, prefix: str = '') -> dict:
         else:
             result[f'{prefix}{key}'] = value
     return result
+
+
+def test_the_processes_of_a_study_load_no_matplotlib():
+    """They draw nothing; it costs each a third of a second, and a cluster may lack it."""
+    studies = (
+        'comparison', 'fault_outcomes', 'patrol.patrol_comparison',
+        'patrol.path_tracker_comparison', 'patrol.safety_study', 'api.parameter_sweep',
+    )  # fmt: skip
+    names = ', '.join(f't3mpc_ros.evaluation.{name}' for name in studies)
+    code = f'import sys, {names}; print("matplotlib" in sys.modules)'
+    assert subprocess.check_output([sys.executable, '-c', code], text=True, cwd=ROOT) == 'False\n'
 
 
 def test_no_file_carries_a_path_of_a_machine_or_a_registry_host():

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 import io
 import math
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -98,14 +98,6 @@ def file_of(figure: Any, kind: str) -> bytes:
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=150, metadata={dated: None} if dated else None)
     return buffer.getvalue()
-
-
-class TitledDrawing(NamedTuple, Generic[Subject]):
-    """A figure with its title."""
-
-    stem: str
-    title: str
-    draw: Callable[[Subject], Any]
 
 
 def write_pictures(

@@ -14,13 +14,13 @@
 """HTML page of a report, from blocks: headings, text, tables, figures, charts and their data."""
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 import json
 from pathlib import Path
 import re
-from typing import Any, Literal
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import zlib
 
 import numpy as np
@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.result_output import Mark, Table, finite
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.page.assets import page_file
+
+Subject = TypeVar('Subject')
 
 MAX_POINTS = 8000
 """Points of a line: a minute at 100 Hz is contained whole, of more the extremes."""
@@ -248,6 +250,14 @@ class Picture:
     def base64(self) -> str:
         """The file in the alphabet of a data URL."""
         return base64.b64encode(self.svg).decode()
+
+
+class TitledDrawing(NamedTuple, Generic[Subject]):
+    """What draws a picture of a subject, with its title."""
+
+    stem: str
+    title: str
+    draw: Callable[[Subject], Any]
 
 
 @dataclass(frozen=True, slots=True)

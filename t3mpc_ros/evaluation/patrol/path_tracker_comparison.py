@@ -33,7 +33,6 @@ from t3mpc_ros.control.velocity_command import LimitParameters
 from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean, rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
-from t3mpc_ros.evaluation.figure_style import TitledDrawing, new_figure
 from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
@@ -494,6 +493,8 @@ def record(study: TrackingStudy) -> dict[str, Any]:
 
 def draw_tracks(study: TrackingStudy) -> Any:
     """Return each path with the drives of ours and of the baselines, first seed."""
+    from t3mpc_ros.evaluation.figure_style import new_figure  # a run does without it
+
     figure, axes = new_figure(6.4, (2, 2))
     axes = axes.ravel()
     for axis in axes[len(study.plan.paths) :]:
@@ -510,4 +511,4 @@ def draw_tracks(study: TrackingStudy) -> Any:
     return figure
 
 
-PICTURES = (TitledDrawing('tracks', 'Drives of the first seed', draw_tracks),)
+PICTURES = (html_page.TitledDrawing('tracks', 'Drives of the first seed', draw_tracks),)

@@ -42,7 +42,6 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     paired,
 )
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
-from t3mpc_ros.evaluation.figure_style import TitledDrawing, draw_world, new_figure, whisker
 from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
@@ -536,6 +535,8 @@ def draw_paths(study: PatrolStudy) -> Any:
 
 def draw_coverage(study: PatrolStudy) -> Any:
     """Return the share of cells entered over time, the mean of the seeds."""
+    from t3mpc_ros.evaluation.figure_style import new_figure  # a run does without it
+
     figure, axis = new_figure(3.2)
     for name, style in _styles(study.plan.paths):
         curve = np.mean(study.table.values('curve', controller=name), axis=0)
@@ -552,6 +553,8 @@ def draw_predictability(study: PatrolStudy) -> Any:
 
     None for patrols that are too short.
     """
+    from t3mpc_ros.evaluation.figure_style import new_figure, whisker
+
     columns = [f'skill_{horizon:g}' for horizon in HORIZONS]
     if not all(columns[0] in row for row in study.table):
         return None
@@ -572,17 +575,21 @@ def draw_predictability(study: PatrolStudy) -> Any:
 
 
 PICTURES = (
-    TitledDrawing('coverage', 'Coverage over time', draw_coverage),
-    TitledDrawing('heat_maps', 'Time in the cells, first seed', draw_heat_maps),
-    TitledDrawing(
+    html_page.TitledDrawing('coverage', 'Coverage over time', draw_coverage),
+    html_page.TitledDrawing('heat_maps', 'Time in the cells, first seed', draw_heat_maps),
+    html_page.TitledDrawing(
         'predictability', 'Skill of an observer who watched the first half', draw_predictability
     ),
-    TitledDrawing('paths', 'Paths, first seed; orange: hits of the range sensors', draw_paths),
+    html_page.TitledDrawing(
+        'paths', 'Paths, first seed; orange: hits of the range sensors', draw_paths
+    ),
 )
 
 
 def _panels(study: PatrolStudy) -> tuple[Any, list[tuple[Any, Row]]]:
     """Return a figure, and an axis with its row for each patrol that is drawn."""
+    from t3mpc_ros.evaluation.figure_style import new_figure
+
     drawn = [row for row in study.table if 'track' in row]
     columns = min(2, len(drawn))
     rows = -(-len(drawn) // columns)
@@ -598,6 +605,8 @@ def _panels(study: PatrolStudy) -> tuple[Any, list[tuple[Any, Row]]]:
 
 
 def _draw_room(axis: Any, world: World | None) -> None:
+    from t3mpc_ros.evaluation.figure_style import draw_world
+
     if world is None:
         return
     draw_world(axis, world)
