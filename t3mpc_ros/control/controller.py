@@ -108,6 +108,9 @@ OTHER_FREQUENCY = 1.5
 """Ratio of the measured frequency of the rotors to the one in use from which it is used."""
 
 POSE_JUMP = 0.25, 0.5  # change of the pose (m, rad) from one message to the next that is no motion
+POSE_FOLLOWS = 3.0
+"""Part of ``watchdog.response_bound`` within which the change of the pose follows commands where
+the twist does not: the pose of a robot that has stopped itself turns with its gyro."""
 SNAPSHOT_PERIOD = 0.25  # time between two snapshots of the weights, s
 SNAPSHOT_COUNT = 3  # number of snapshots kept; the oldest one is older than the response time-out
 
@@ -308,6 +311,11 @@ class Controller:
         self._sample_reference = TypedKernel(sample_reference)
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
+        near = parameters.watchdog.response_bound / POSE_FOLLOWS
+        self._pose_response = ResponseMonitor(
+            replace(parameters.watchdog, response_bound=near), self._period
+        )
+        """By the change of the pose, while the twist of the odometry is used."""
         self.wheel_monitor = WheelMonitor(parameters.watchdog, self._period)
         """Which wheel was at a speed that no command of late explains."""
         self._trajectory = ReferenceTrajectory(_least_jump(parameters.limits))
@@ -346,6 +354,7 @@ class Controller:
         )
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()  # whether the odometry has a twist
+        self._twist_believed = True  # whether it was used at the last step
         self.stamp_filter = StampFilter()  # whether its stamps jitter
         self.odometry_used = True
         """Whether the last message was used: not repeated or overtaken, and its stamp no leap."""
@@ -472,7 +481,7 @@ class Controller:
         self.law.predictive.pretrain()
         self.body.reset()
         self._stop()
-        self._response.reset()
+        self._reset_response()
         self.wheel_monitor.reset()
         self.pose_controller.reset()
         self._begin()
@@ -534,9 +543,10 @@ class Controller:
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamped)
         twist = self.odometry_twist
-        believed = not twist.replaced
         odometry = twist.measured(odometry, restart=elapsed is None)
-        if believed and twist.replaced and not (twist.missing and twist.known):
+        believed, self._twist_believed = self._twist_believed, not twist.replaced
+        disbelieved = believed and twist.replaced and not (twist.missing and twist.known)
+        if disbelieved:
             elapsed = None  # the speeds before were no measurements: all estimates begin again
             self.dead_time = self._make_dead_time_estimator()
             self.wheel_monitor.reset()
@@ -577,15 +587,24 @@ class Controller:
             self._moving = True
             return self._command_unresponsive(odometry, dt)
         restart = elapsed is None or not self._moving
+        # A robot that drives on where only its speeds are known anew: the plan is kept.
+        followed = self._response.responsive
+        follows = disbelieved and self._moving and followed
         if not restart:
             self.wheel_monitor.update(stamp, speeds.tolist(), actuation.command.tolist())
         if restart:
             self.wheel_monitor.interrupt()
-            actuation.reset(speeds)
-            self._response.reset()
+            actuation.reset(speeds, follows=follows)
+            self._reset_response()
             self._snapshots.clear()
-        elif not self._response.update(*speeds.tolist()):
-            return self._command_unresponsive(odometry, dt)
+        elif not self._is_responsive(speeds):
+            by_pose = self._twist_believed and self._pose_response.responsive
+            if not (followed and by_pose):
+                return self._command_unresponsive(odometry, dt)
+            twist.reject()  # from the next message on
+            self._reset_response()
+            self._add_command()
+            return actuation.twist, self.status
         elif self.status.reason is Reason.NOT_FOLLOWING:
             restart = True
             actuation.reset(speeds, actuation.command.copy())
@@ -594,7 +613,7 @@ class Controller:
             if restart:
                 self.pose_controller.reset()
             self._follow_pose(odometry, begin, end, dt)
-        if restart:
+        if restart and not follows:
             self._begin_plan(stamp, plan_ns)
         applied = self._send(stamp, plan_ns, odometry.pose.yaw, dt)
         short = self.parameters.composition == 'paper' and self._reach.update(
@@ -662,8 +681,24 @@ class Controller:
         _, _, begin, end = self._sampled
         acceleration = self._acceleration(plan_ns, yaw, begin, end, elapsed)
         applied = self.actuation.send_acceleration(acceleration, elapsed).copy()
-        self._response.add_command(*self.actuation.command.tolist())
+        self._add_command()
         return applied
+
+    def _add_command(self) -> None:
+        for monitor in (self._response, self._pose_response):
+            monitor.add_command(*self.actuation.command.tolist())
+
+    def _reset_response(self) -> None:
+        """Assume a robot that follows its commands."""
+        self._response.reset()
+        self._pose_response.reset()
+
+    def _is_responsive(self, speeds: Array) -> bool:
+        """Whether the robot follows commands, by the speeds (rad/s) that are used."""
+        if self._twist_believed:
+            by_pose = self.odometry_twist.speeds_by_pose
+            self._pose_response.update(*wheels_from_twist(by_pose, self.parameters.geometry))
+        return self._response.update(*speeds.tolist())
 
     def _check_keep_out(self, odometry: State, reason: Reason, begin: Array) -> Reason:
         """Return the reason after contact and range sensors; ``begin``: planned speeds, rad/s."""
@@ -878,7 +913,7 @@ class Controller:
             self.actuation.send_speeds(begin)
         else:
             self.actuation.send_speeds(reference)
-        self._response.add_command(*self.actuation.command.tolist())
+        self._add_command()
         error = speeds - reference
         self.status = self._make_status(odometry.stamp_ns, Reason.NOT_FOLLOWING, error)
         return self.actuation.twist, self.status

@@ -166,9 +166,9 @@ FIT_PRIOR = (10.0, 0.1, 0.003), (10.0, 0.1, 0.05, 1.0)
 """Standard deviation before any comparison of factor less 1, lag (s) and offset of each velocity;
 of the angular one also that of its share of the linear one, rad/m: wheels of unequal radii."""
 FIT_VARIANCE = 2.0  # variance of a fit over that with independent comparisons
-ALONE = (
-    1.5  # square that a factor alone leaves, over that of the whole fit, up to which it is used
-)
+ALONE, OFFSETS = 1.5, 2.0
+"""Square that a factor alone leaves, over that of the whole fit, up to which it is used; standard
+deviations before any comparison up to which an offset that leaves no more is as likely."""
 TWIST_CERTAIN, LATE_CERTAIN = 4.0, 3.3
 """Standard deviations of a deviation between twist and pose that counts."""
 TWIST_TOLERANCE, OFFSET_TOLERANCE = 0.05, 0.004
@@ -202,6 +202,11 @@ pose stays the same, the excess is so many times larger."""
 UNITS_COUNT, UNITS_MOST, UNITS_MOTION = 10, 100, (0.02, 0.15)
 """Messages that contradict, more than others, from which the units are wrong; the most that
 count; and the velocities by the pose (m/s, rad/s) of a message that counts as another one."""
+
+UNITS_MEMORY, UNITS_NOISE = 0.95, (0.3, 1.5)
+"""Forgetting factor of the noise of the twist, which is its change from one message to the next;
+noise (m/s, rad/s; root mean square) that contradicts a pose which has a FAR-th of it: wheels that
+spin have none, and at rest nothing else shows units."""
 
 
 class VelocityFit:
@@ -249,9 +254,16 @@ class VelocityFit:
         if not motion:
             return
         rest_alone = (self._square - product**2 / motion) / (self.rows - 1.0)
-        if rest_alone < ALONE * self._noise:
+        if rest_alone < ALONE * self._noise and not self._is_offset:
             self.values[0] = product / motion
             self.deviations[0] = math.sqrt(FIT_VARIANCE * max(rest_alone, self._least) / motion)
+
+    @property
+    def _is_offset(self) -> bool:
+        """Whether an offset alone, as that of a gyro, explains the twist as well."""
+        offset = float(self._product[2] - self._normal[0, 2]) / self.rows
+        rest = (self._apart - self.rows * offset**2) / (self.rows - 1.0)
+        return abs(offset) < OFFSETS * self._precision[2] ** -0.5 and rest < ALONE * self._noise
 
     def is_certain(self, index: int, times: float) -> bool:
         """Whether a value is not the one of a twist that fits."""
@@ -361,6 +373,11 @@ class TwistFit:
         self._from: State | None = None
         self._held_for, self._held_way = 0.0, [0.0, 0.0]
         """Time for which the pose has been the same (s), and way by the twist since then."""
+
+    def reject(self) -> None:
+        """Take the twist for wrong, until enough comparisons say what is wrong with it."""
+        self.wrong, self.factor, self._age = 'the robot follows its commands by', 1.0, 0.0
+        self.uses_pose = [True, True]
 
     def update(self, new: State, motion: tuple[float, float, float]) -> None:
         """Compare the twist of a message with the motion since the last one."""
@@ -501,34 +518,45 @@ class TwistFit:
 class TwistUnits:
     """Whether the twist of the odometry is far beyond the change of its pose, in either velocity.
 
-    So it is in degrees or millimetres per second. A robot at rest agrees with any unit: such a
-    twist is found while the robot moves, however little, before it is taken to diverge.
+    So it is in degrees or millimetres per second. It is found while the robot moves, however
+    little, or at rest by its noise, before the robot is taken to diverge.
     """
 
     def __init__(self) -> None:
         self.wrong = False
         self.example = ''
         """Twist and change of the pose in a message in which they contradict each other."""
-        self._count = 0
+        self._counts = [0, 0]
+        self._before: list[tuple[float, float] | None] = [None, None]
+        self._sums = [[0.0] * 3 for _ in range(2)]
+        """Of each velocity: number of changes, squared noise of the twist, and of the pose."""
 
     def update(self, last: State, new: State, motion: tuple[float, float, float]) -> None:
         """Compare the twist of a message with the motion since the last one."""
         # That of a camera which is slower than the wheels stays the same for a while.
         times = FAR_UNCHANGED if new.pose == last.pose else 1.0
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        ahead, turn, (linear, angular) = motion[0] / elapsed, motion[2] / elapsed, new.twist
-        if (
-            abs(linear) > FAR * abs(ahead) + times * FAR_BEYOND[0]
-            or abs(angular) > FAR * abs(turn) + times * FAR_BEYOND[1]
-        ):
-            self._count = min(self._count + 1, UNITS_MOST)
-            self.example = (
-                f'{linear:.3g} m/s and {angular:.3g} rad/s, where its pose says {ahead:.3g} and '
-                f'{turn:.3g}'
-            )
-        elif abs(ahead) > UNITS_MOTION[0] or abs(turn) > UNITS_MOTION[1]:
-            self._count = max(self._count - 1, 0)
-        self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
+        rates = motion[0] / elapsed, motion[2] / elapsed
+        for i, (given, rate) in enumerate(zip(new.twist, rates, strict=True)):
+            far = abs(given) > FAR * abs(rate) + times * FAR_BEYOND[i]
+            if self._is_noisy(i, given, rate) or far:
+                self._counts[i] = min(self._counts[i] + 1, UNITS_MOST)
+                self.example = (
+                    f'{new.twist.linear:.3g} m/s and {new.twist.angular:.3g} rad/s, where its '
+                    f'pose says {rates[0]:.3g} and {rates[1]:.3g}'
+                )
+            elif abs(rate) > UNITS_MOTION[i]:  # degrees are nothing on a robot that goes straight
+                self._counts[i] = max(self._counts[i] - 1, 0)
+        most = max(self._counts)
+        self.wrong = most >= UNITS_COUNT or (self.wrong and most > 0)
+
+    def _is_noisy(self, i: int, given: float, rate: float) -> bool:
+        """Whether a velocity of the twist has far more noise than the pose, and than any robot."""
+        sums, before = self._sums[i], self._before[i] or (given, rate)
+        self._before[i] = given, rate
+        each = 1.0, 0.5 * (given - before[0]) ** 2, 0.5 * (rate - before[1]) ** 2
+        sums[:] = (UNITS_MEMORY * old + new for old, new in zip(sums, each, strict=True))
+        return sums[1] > max(UNITS_NOISE[i] ** 2 * sums[0], FAR**2 * sums[2])
 
 
 HELD_MOST, HELD_MEMORY = 0.25, 0.97
@@ -600,7 +628,7 @@ class PoseSpeeds:
         """Time by which the speeds are later than those of a pose that is new each time, s."""
         self.holds = False  # whether it is so as a rule
         self._from: State | None = None
-        self._speeds = STANDSTILL
+        self.speeds = STANDSTILL
 
     def update(
         self, new: State, elapsed: float | None, motion: tuple[float, float, float] | None
@@ -608,15 +636,15 @@ class PoseSpeeds:
         """Return the speeds, by time (s) and motion since the last message; None for the first."""
         last = self._from
         if elapsed is None or motion is None or last is None:
-            self._from, self._speeds = new, STANDSTILL
+            self._from, self.speeds = new, STANDSTILL
             return STANDSTILL
         time = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
         # Not at single messages: a robot that creeps in steps of its pose has moved meanwhile.
         self.holds = self.lateness > 0.5 * elapsed
         if new.pose == last.pose:
             if not self.holds or time > self.held - 0.5 * elapsed:
-                self._speeds = STANDSTILL
-            return self._speeds
+                self.speeds = STANDSTILL
+            return self.speeds
         if time < HELD_MOST:
             self.held = max(HELD_MEMORY * self.held, time)
             self.lateness += LATENESS_SHARE * (time - elapsed - self.lateness)
@@ -625,8 +653,8 @@ class PoseSpeeds:
         if not self.holds:
             time = elapsed
         ahead, _, turn = motion
-        self._from, self._speeds = new, BodyTwist(ahead / time, turn / time)
-        return self._speeds
+        self._from, self.speeds = new, BodyTwist(ahead / time, turn / time)
+        return self.speeds
 
 
 class OdometryTwist:
@@ -653,6 +681,15 @@ class OdometryTwist:
         fit = self._fit
         wrong = self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
         return wrong or self._blanks.known
+
+    @property
+    def speeds_by_pose(self) -> BodyTwist:
+        """Speeds by the change of the pose since the last message, m/s and rad/s."""
+        return self._by_pose.speeds
+
+    def reject(self) -> None:
+        """Use the pose: by it the robot follows its commands, by the twist it does not."""
+        self._fit.reject()
 
     @property
     def lateness(self) -> float:

@@ -221,16 +221,20 @@ class VelocityActuation:
         for each in self._deadbands:
             each.speed = min(limits.deadband, 0.1 * limits.wheel_speed)
 
-    def reset(self, speeds: Array, last_command: Array | None = None) -> None:
+    def reset(
+        self, speeds: Array, last_command: Array | None = None, *, follows: bool = False
+    ) -> None:
         """Restart at measured wheel speeds, rad/s, shape (2,).
 
         The next command is within the acceleration limits of the last one; without that one the
         robot was commanded to stop, or by others. A robot that moves is taken over at its speed.
-        One that may as well stand starts from standstill: its first command would otherwise be a
-        step to the noise of one measurement.
+        One that may as well stand starts from standstill, and one that ``follows`` at the speed
+        that was commanded last: the first command would otherwise be a step to the noise of one
+        measurement.
         """
-        if self.takes_speeds and np.abs(speeds).max() <= self._rest_speed:
-            speeds = np.zeros(2)
+        expected = self.command.copy() if follows else np.zeros(2)
+        if self.takes_speeds and np.abs(speeds - expected).max() <= self._rest_speed:
+            speeds = expected
         self.speed_filter.reset(speeds)
         self.applied[:] = 0.0
         self._sent = False

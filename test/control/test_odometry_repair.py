@@ -185,6 +185,35 @@ def test_a_twist_in_other_units_is_replaced_by_the_pose(drive, factors):
     assert np.abs(used[300:] - true[300:]).max() < 0.03
 
 
+@pytest.mark.parametrize(('factors', 'noise'), [((1.0, 57.3), 3.9), ((1000.0, 1.0), 5.0)])
+def test_units_are_found_at_rest_by_the_noise(factors, noise):
+    """A robot was commanded at 9 rad/s from rest, then stopped, up to nine times in a row."""
+    twist, used = twists_of(
+        lambda time: (0.0, 0.0),
+        seconds=0.5,
+        factors=factors,
+        noise=noise * np.array(factors) / max(factors),
+    )
+    assert 'cannot be in m/s and rad/s' in twist.problem()
+    assert (used[25:] == 0.0).all()
+
+
+@pytest.mark.parametrize('noise', [(0.05, 0.6), (0.15, 0.75)])
+def test_a_noisy_twist_is_in_its_units(noise):
+    twist, _ = twists_of(lambda time: (0.0, 0.0), noise=np.array(noise))
+    assert not twist.replaced
+
+
+def test_a_twist_in_degrees_is_not_believed_on_the_straight():
+    """There it agrees with the pose: the robot stopped as soon as it turned, again and again."""
+
+    def drive(time):
+        return 0.2, 1.0 if time % 6.0 < 2.0 else 0.0
+
+    _, used = twists_of(drive, factors=(1.0, 57.3), seconds=30.0)
+    assert np.abs(used[20:, 1]).max() < 1.1
+
+
 @pytest.mark.parametrize('rate', [4, 20])
 def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
     """The pose is that of the last picture; in the next one it has moved far."""

@@ -189,6 +189,22 @@ def _commands(limits, goals):
     return np.array(commands)
 
 
+def test_a_robot_that_follows_is_not_shaken_by_a_measurement():
+    """The first speeds by the pose in place of a wrong twist were a step of the command."""
+    drive = _drive(noise_variance=0.04)
+    drive.send_speeds(np.array([3.0, -2.0]))
+    sent = drive.command.copy()
+    assert sent.any()
+    noise = np.array([0.9, -0.7])
+    drive.reset(sent + noise, follows=True)
+    np.testing.assert_array_equal(drive.command, sent)
+    np.testing.assert_array_equal(drive.speeds, sent)
+    for measured, follows in ((sent + 1.2, True), (sent + 1.2, False), (np.zeros(2), True)):
+        drive.reset(measured, follows=follows)  # another robot, or one that does not follow
+        np.testing.assert_allclose(drive.command, measured)
+        drive.reset(sent)
+
+
 @pytest.mark.parametrize('acceleration', [1.0, 30.0])
 def test_slow_commands_are_left_out_within_the_limits(acceleration):
     """A sweep through zero commands stop or the deadband; the step between them is limited too."""

@@ -56,6 +56,7 @@ def test_what_is_assumed_wrongly_is_assumed_by_every_method(monkeypatch):
         ('stamps of the odometry off by up to 3 ms', 'the stamps of odom jitter', 2001),
         ('twist of the odometry + 10 %', 'times the change of its pose', 2001),
         ('twist of the odometry in mm/s', 'cannot be in m/s and rad/s', 2001),
+        ('twist of the odometry in degrees/s', 'cannot be in m/s and rad/s', 2005),
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz', 2001),
         ('shaper for another robot', 'the robot oscillates in yaw with', 2005),
         ('lag 20 ms assumed, none', 'too early for a speed_filter.lag of 0.02 s', 2003),
@@ -100,6 +101,7 @@ LATE = ('lag 20 ms assumed, none',)
     'name',
     few_of(
         [
+            'twist of the odometry of the world',  # shaken when it was replaced: 2.2 times
             'no twist in the odometry',  # its errors were five times those of an open loop
             'noise 0.04 (rad/s)², none assumed',
             'twist of the odometry + 10 %',
