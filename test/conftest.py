@@ -78,6 +78,9 @@ def pytest_configure(config):
     """End as with Ctrl-C at SIGTERM: fixtures then end the nodes that they have started."""
     # A run that a time limit had ended left graphs of nodes behind, which ran for ever.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A shell lets what it starts in the background ignore Ctrl-C; the processes of the tests,
+    # which inherit that, would be killed after a time-out instead of ending.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     # With the limits of Python, garbage collection takes a seventh of the time of all tests.
     gc.set_threshold(50_000, 20, 100)
 

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Waits of the tests; on a busy machine their time-outs, and nothing else, are inconclusive."""
 
+from pathlib import Path
 import subprocess
 import time
 
@@ -86,6 +87,14 @@ def wait_for_end(process, seconds=TIMEOUT):
     """Return the exit code of a process once it has ended."""
     wait_until(lambda: process.poll() is not None, f'{process.args} runs', seconds)
     return process.returncode
+
+
+def is_running(pid):
+    """Return whether a process runs: a zombie does not."""
+    try:
+        return Path('/proc', str(pid), 'stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
 
 
 def communicate(process, seconds=TIMEOUT):
