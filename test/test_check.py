@@ -23,7 +23,7 @@ import subprocess
 import sys
 
 import pytest
-from support.waiting import communicate, run, wait_until
+from support.waiting import communicate, is_running, run, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = """
@@ -43,16 +43,19 @@ with open('calls', 'a') as calls:
     calls.write(json.dumps([module, *words]) + '\\n')
 plan = json.load(open('plan'))
 stage = ' '.join([module, *words[:1]]) if module == 'ruff' else module
-if module == 'pytest':
-    number = sum(json.loads(line)[0] == 'pytest' for line in open('calls'))
+path = words[0].removeprefix('--outcomes=') if module == 'pytest' else os.devnull
+if path.endswith('computed'):
+    stage = 'computing'
+elif module == 'pytest':
+    known = [json.loads(line) for line in open('calls')]
+    number = sum(call[0] == 'pytest' and call[1].endswith('outcomes') for call in known)
     stage = 'again' if words[1:3] == ['-n', '0'] else f'pytest {number}'
 code, *lines = plan.get(stage, [0])
-path = words[0].removeprefix('--outcomes=') if module == 'pytest' else os.devnull
 with open(path, 'a') as outcomes:
     outcomes.writelines(line + '\\n' for line in lines)
 if code == 'wait':
     signal.signal(signal.SIGINT, lambda *_: sys.exit(2))
-    open('waiting', 'w').close()
+    open(f'waiting {os.getpid()}', 'w').close()
     time.sleep(60.0)
 if code < 0:
     os.kill(os.getpid(), -code)
@@ -102,6 +105,9 @@ LATER = [
         4,
         ['inconclusive: 2 tests'],
     ),
+    ({'computing': FAILURE}, 1, ['test_three', 'tests that only compute (exit code 1)']),
+    ({'computing': [-9, 'passed x']}, 1, ['tests that only compute (exit code 137)']),
+    ({'computing': WAITED, 'again': [0, f'passed {A}', f'passed {B}']}, 0, ['passed']),
 ]
 """The same in later stages, which a run without arguments has."""
 STAGES = ['ruff', 'ruff', 'mypy', 'pytest']
@@ -133,7 +139,7 @@ def check(checkout, plan, *arguments):
 @pytest.mark.parametrize(
     'arguments, stages, cases',
     [
-        pytest.param([], [*STAGES, 'pytest', 'pytest'], CASES + LATER, marks=pytest.mark.long),
+        pytest.param([], [*STAGES, *3 * ['pytest']], CASES + LATER, marks=pytest.mark.long),
         (['--quick'], STAGES, CASES[1::3]),
         (['-k', 'some test'], STAGES, CASES[:1]),
         (['--tests', '-k', 'some test'], ['pytest'], CASES[5:7]),
@@ -164,18 +170,21 @@ def test_the_documented_exit_codes_are_produced():
     assert all(f'exit code {code}' in rows for code in (1, 4))
 
 
-def test_ctrl_c_ends_the_run_at_once(checkout):
+@pytest.mark.parametrize('waiting', [['pytest 1'], ['pytest 2', 'computing', 'mypy']])
+def test_ctrl_c_ends_the_run_at_once(waiting, checkout):
     """For pytest it is a failure, after which the next stage would begin."""
-    (checkout / 'plan').write_text(json.dumps({'pytest 1': ['wait']}))
+    (checkout / 'plan').write_text(json.dumps(dict.fromkeys(waiting, ['wait'])))
     process = subprocess.Popen(
         [checkout / 'scripts' / 'check'],
         stderr=subprocess.PIPE,
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    wait_until((checkout / 'waiting').exists)
+    wait_until(lambda: len([*checkout.glob('waiting *')]) == len(waiting))
     os.killpg(process.pid, signal.SIGINT)
     communicate(process)
     assert process.returncode == 128 + signal.SIGINT
+    begun = [int(path.name.split()[1]) for path in checkout.glob('waiting *')]
+    wait_until(lambda: not any(map(is_running, begun)))
     calls = (checkout / 'calls').read_text().splitlines()
-    assert sum('"pytest"' in call for call in calls) == 1
+    assert sum('/outcomes"' in call for call in calls) == int(waiting[0][-1])
