@@ -186,7 +186,7 @@ def _best(t, x, y):
 
 
 def test_a_closed_curve_is_predicted_exactly():
-    t = np.arange(0.0, 300.0, 0.1)
+    t = np.arange(0.0, 120.0, 0.1)
     skills = predictability(t, np.cos(t / 3.0), np.sin(2.0 * t / 3.0))
     assert [each.horizon for each in skills] == list(HORIZONS)
     assert min(each.best for each in skills) > 0.999

@@ -205,14 +205,14 @@ def test_a_path_replaces_the_one_before_and_an_empty_one_stops(harness):
 
 
 class _SetOdometry(_PathDrive):
-    """A robot that does not move, at the end of a path of 1 m or on it, whose odom is set to 0."""
+    """A robot that stands, at the end of a path of 0.5 m or on it, whose odom is set to 0."""
 
     def __init__(self, harness, *, at_rest, **parameters):
         super().__init__(harness, **parameters)
         planner = harness.connected_publisher(Path, 'path')
         self.until(bool)
-        planner.publish(_path([(0.5, -0.2), (1.5, -0.2)]))
-        self.until(lambda m: m.pose.pose.position.x > 1.0)
+        planner.publish(_path([(0.5, -0.2), (1.0, -0.2)]))
+        self.until(lambda m: m.pose.pose.position.x > 0.75)
         if at_rest:
             self.until(lambda m: speed(m) == 0.0)
         self.before = self.received[-1]
@@ -242,8 +242,8 @@ def test_a_robot_whose_odom_is_set_rests(harness, logged, at_rest):
     assert logged('odom has jumped by')
     assert diagnostic(drive.node, 'odometry_jumps') == 1
     assert ('its path has ended' in reason(drive.node)) == (not at_rest)
-    harness.connected_publisher(Path, 'path').publish(_path([(0.0, 0.0), (1.0, 0.0)]))
-    drive.until(lambda m: m.pose.pose.position.x > 0.5)
+    harness.connected_publisher(Path, 'path').publish(_path([(0.0, 0.0), (0.5, 0.0)]))
+    drive.until(lambda m: m.pose.pose.position.x > 0.2)
     assert 'its path has ended' not in reason(drive.node)
 
 
@@ -252,11 +252,11 @@ def test_a_pose_may_jump_in_a_map(harness):
     drive = _PathDrive(harness, frame_id='map')
     planner = harness.connected_publisher(Path, 'path')
     drive.until(bool)
-    planner.publish(_path([(0.5, -0.2), (1.5, -0.2)], 'map'))
-    drive.until(lambda m: m.pose.pose.position.x > 1.0)
+    planner.publish(_path([(0.5, -0.2), (1.0, -0.2)], 'map'))
+    drive.until(lambda m: m.pose.pose.position.x > 0.75)
     drive._places.publish(odometry(stamp(drive.received[-1])))
     drive.until(lambda m: speed(m) == 0.0)
-    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.5, abs=1e-6)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.0, abs=1e-6)
     assert diagnostic(drive.node, 'odometry_jumps') == 0
 
 
