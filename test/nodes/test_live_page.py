@@ -22,7 +22,7 @@ from t3mpc_ros.cli.view import PAGE_AT
 from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 ROBOT = {'world': 'room', 'noise.variance': 0.04}
 SWITCHING = {'switching.times': [3.0, 6.0]}

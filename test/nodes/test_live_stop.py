@@ -19,7 +19,7 @@ import signal
 import pytest
 from support.robot_page import FOCUS, LATCHED, UNCONFIRMED, RobotPage
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 
 @pytest.fixture(scope='module')

@@ -36,12 +36,13 @@ from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.cli.process_group import ProcessError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-pytestmark = [pytest.mark.ros, pytest.mark.timed]
+pytestmark = pytest.mark.ros
 
 SLOTS = 3
 """Recorders at a time."""
 
 
+@pytest.mark.timed
 @pytest.mark.long
 def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
     """``bench/recorder_load.py`` runs this for a minute and prints the processor load."""
@@ -145,6 +146,7 @@ def kill_in_sequence(folder, slot, publisher, turns):
     return result
 
 
+@pytest.mark.timed
 @pytest.mark.slow
 @pytest.mark.parametrize('turns', few_of([1, 4]))
 def test_a_kill_loses_at_most_one_second(turns, publisher, tmp_path):
@@ -176,6 +178,7 @@ def test_a_kill_loses_at_most_one_second(turns, publisher, tmp_path):
     assert max(losses) <= 1.0
 
 
+@pytest.mark.timed
 def test_a_recorder_killed_after_a_pause_has_lost_nothing(processes, publisher, tmp_path):
     start(processes, tmp_path / 'bag')
     publisher.wait_for_recorder()
