@@ -29,7 +29,7 @@ from support.bag_messages import START, diagnostics, twist_message
 from support.long_tests import few_of
 from support.robot_bags import following_rows, write
 from support.signals import attend
-from support.waiting import communicate, run, wait_until
+from support.waiting import communicate, is_running, run, wait_until
 
 from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.demo import DEMO_EXIT_CODES, _new_run
@@ -120,13 +120,9 @@ def read_until(demo, text):
 
 def alive(folder):
     """Return the names of the stand-ins that still run."""
-    found = []
-    for path in folder.glob('*.pid'):
-        text = path.read_text()
-        state = Path('/proc', text, 'stat')
-        if text and state.exists() and state.read_text().rpartition(')')[2].split()[0] != 'Z':
-            found.append(path.stem)
-    return found
+    return [
+        path.stem for path in folder.glob('*.pid') if (pid := path.read_text()) and is_running(pid)
+    ]
 
 
 PHASES = {

@@ -93,7 +93,7 @@ def is_running(pid):
     """Return whether a process runs: a zombie does not."""
     try:
         return Path('/proc', str(pid), 'stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return False
 
 
