@@ -15,7 +15,7 @@
 
 import pytest
 
-from t3mpc_ros.parameters.yaml_file import (
+from t3mpc_ros.parameters.user_yaml import (
     MAX_FILE_SIZE,
     YamlError,
     parse_yaml,
