@@ -15,7 +15,8 @@
 
 The filter is updated when the robot has moved, as in nav2_amcl: readings of a robot at rest
 repeat their errors. Each reading counts once, along the beam on which it was taken: in the frame
-of the odometry at that instant.
+of the odometry at that instant. The particles go their way, by the last reading of each sensor;
+while the place is known, the pose that is tracked beside them, by all readings, is the result.
 """
 
 from collections import deque
@@ -43,6 +44,7 @@ from t3mpc_ros.localization.particle_filter import (
     ParticleFilter,
     ParticleFilterParameters,
 )
+from t3mpc_ros.localization.pose_tracking import PoseTracker
 from t3mpc_ros.localization.range_model import (
     NAMES,
     Beams,
@@ -61,6 +63,8 @@ LONGEST_SILENCE = 2.5
 lose one scan."""
 LARGEST_VARIANCES = 25.0, 25.0, 10.0
 """Largest variances of x, y (m²), yaw (rad²) of a pose that is given: it says nothing beyond."""
+TRACKED_READINGS = 12
+"""Number of the last readings of a sensor by which the pose is tracked: of half a second."""
 SCAN = -1
 """Number of a scan among the sensors."""
 LONGEST_UPDATE = 60.0
@@ -203,10 +207,11 @@ class Localizer:
         self._places = known.free_places(parameters.robot_radius)
         self.filter = ParticleFilter(parameters, known.field, self._places, self._model)
         """The particles."""
+        self._tracker = PoseTracker(known.field, self._model, len(mounts))
         self.changes = ChangeDetector(parameters.changes, known.field, self._model)
         """What contradicts the map."""
-        self.result: LocalizedPose | None = None
-        """Pose of the last update; None before the first."""
+        self._estimate: LocalizedPose | None = None
+        """By the particles, at the last update; None before the first."""
         self.agreement = 1.0 if parameters.set_initial_pose else parameters.lost_agreement
         """Share of the telling readings that fit to the map, of the last 20 or so."""
         self._fits = np.ones(len(mounts))
@@ -237,6 +242,8 @@ class Localizer:
         """Time by the odometry since the last reading that was used, s."""
         self._pending: dict[int, tuple[Pose, Beams]] = {}
         """Beams since the last update by sensor, each with the odometry at its instant."""
+        self._readings: dict[int, deque[Beams]] = {}
+        """Those for the tracking, in the frame of the odometry."""
         if parameters.set_initial_pose:
             initial = parameters.initial_pose
             variances = initial.covariance_x, initial.covariance_y, initial.covariance_yaw
@@ -288,22 +295,36 @@ class Localizer:
         self.agreement = self.parameters.lost_agreement if searching else 1.0
         self._fits[:] = 1.0
         self._witnesses = self._witnesses[:0]
+        self._tracker.active = False
         self._pending.clear()
+        self._readings.clear()
         self._updated = None  # the next odometry is an update without a motion
+
+    @property
+    def result(self) -> LocalizedPose | None:
+        """Pose that is tracked, or else of the particles at the last update; None before that."""
+        found, odometry = self._estimate, self._odometry
+        tracked = self._tracker.active and self.state is Localization.LOCALIZED
+        if found is None or odometry is None or not tracked:
+            return found
+        pose, covariance = self._tracker.pose, found.covariance
+        if not self.silent:
+            covariance = self._tracker.covariance + np.diag(np.square(SYSTEMATIC))
+        return LocalizedPose(self._stamp_ns, pose, covariance, frame_between(pose, odometry))
 
     @property
     def state(self) -> Localization:
         """What is known of the place."""
-        if self.result is None:
+        if self._estimate is None:
             return Localization.NO_ODOMETRY
         if self.agreement < self.parameters.lost_agreement:
             return Localization.LOST
         if self._searching:
             return Localization.SEARCHING
-        largest = float(np.diag(self.result.covariance).max())
+        largest = float(np.diag(self._estimate.covariance).max())
         if math.sqrt(largest) > self.parameters.localized_deviation:
             return Localization.SEARCHING
-        on_map = self._field.contains(self.result.pose.x, self.result.pose.y)
+        on_map = self._field.contains(self._estimate.pose.x, self._estimate.pose.y)
         return Localization.LOCALIZED if on_map else Localization.OFF_MAP
 
     @property
@@ -344,6 +365,10 @@ class Localizer:
         if abs(lead) > DISORDER:  # taken elsewhere than where the last odometry was
             return f'it is stamped {abs(lead):.1f} s {"after" if lead > 0.0 else "before"} odom'
         self._pending[sensor] = self._odometry, beams
+        readings = self._readings.setdefault(sensor, deque(maxlen=TRACKED_READINGS))
+        # One that comes again was taken where the robot was before.
+        if not readings or not np.array_equal(readings[-1].reading, beams.reading):
+            readings.append(beams._replace(origin=transformed(self._odometry, beams.origin)))
         self.silence = 0.0
         return ''
 
@@ -362,16 +387,18 @@ class Localizer:
         self._odometry, self._stamp_ns = pose, stamp_ns
         if last is not None and has_jumped(last, pose, stamp_ns - last_ns):
             self._pending.clear()
+            self._readings.clear()
             self._updated, self._updated_ns = pose, stamp_ns
-            if self.result is None:
+            if self._estimate is None:
                 return False
-            frame = frame_kept(self.result.odometry_frame, last, pose)
-            self.result = self.result._replace(
+            frame = frame_kept(self._estimate.odometry_frame, last, pose)
+            self._estimate = self._estimate._replace(
                 stamp_ns=stamp_ns, pose=pose_in(frame, pose), odometry_frame=frame
             )
             return True
         since = 0.0 if last is None else min((stamp_ns - last_ns) / NANOSECONDS, DISORDER)
         self.silence += since
+        self._tracker.predict(last or pose, pose, since)
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters
@@ -388,6 +415,7 @@ class Localizer:
         self.filter.correct(known, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
         self._compare(known)
+        self._track(pose, known, elapsed)
         for sensor, each in of_the_map.items():
             if sensor != SCAN:
                 self._fits[sensor] = followed(self._fits[sensor], self._explain(each)[:, 0])
@@ -395,15 +423,29 @@ class Localizer:
             self._detect(joined([each for name, each in taken.items() if name not in doubtful]))
         return found
 
+    def _track(self, odometry: Pose, known: Beams, elapsed: float) -> None:
+        """Correct the pose that is tracked; where the place is known it begins anew."""
+        assert self._estimate is not None
+        if self._tracker.active:
+            back = frame_between(ORIGIN, odometry)
+            for sensor in sorted(self._readings.keys() - {*self.doubtful}):
+                beams = joined(self._readings[sensor])
+                here = beams._replace(origin=transformed(back, beams.origin))
+                self._tracker.correct(self._of_the_map(here, odometry), sensor)
+            self._tracker.compare(self._estimate.pose, known, elapsed)
+        self._readings.clear()
+        if not self._tracker.active and self.state is Localization.LOCALIZED:
+            self._tracker.begin(self._estimate.pose, self._estimate.covariance)
+
     def _turn(self, odometry: Pose, elapsed: float) -> None:
         """Turn the origin of the odometry about the robot as its yaw drifts."""
-        if self._drift == 0.0 or self.result is None:
+        if self._drift == 0.0 or self._estimate is None:
             return
         turn = self._drift * elapsed
         self._turned += turn
-        expected = pose_in(self.result.odometry_frame, odometry)
+        expected = pose_in(self._estimate.odometry_frame, odometry)
         frame = frame_between(expected._replace(yaw=expected.yaw + turn), odometry)
-        self.result = self.result._replace(odometry_frame=frame)
+        self._estimate = self._estimate._replace(odometry_frame=frame)
 
     def _learn_drift(self, correction: float) -> None:
         """Follow the drift by a correction (rad) of the yaw since the last update."""
@@ -415,11 +457,11 @@ class Localizer:
 
     def _of_the_map(self, beams: Beams, odometry: Pose) -> Beams:
         """Return the beams without those of what has changed, by the pose before these beams."""
-        if self.result is None or not self.parameters.changes.enabled:
+        if self._estimate is None or not self.parameters.changes.enabled:
             return beams
-        expected = pose_in(self.result.odometry_frame, odometry)
+        expected = pose_in(self._estimate.odometry_frame, odometry)
         before_ns = self._found_ns if self._in_doubt else math.inf
-        known = ~self.changes.explained(expected, self.result.covariance, beams, before_ns)
+        known = ~self.changes.explained(expected, self._estimate.covariance, beams, before_ns)
         return Beams(*(part[known] for part in beams))
 
     def _detect(self, beams: Beams) -> None:
@@ -427,16 +469,16 @@ class Localizer:
 
         After a slip all readings contradict the map until the filter has corrected the pose.
         """
-        assert self.result is not None
+        assert self._estimate is not None
         assert self._odometry is not None
-        stamp_ns, pose, _, frame = self.result
+        stamp_ns, pose, _, frame = self._estimate
         self._frames.append((stamp_ns, frame))
         while not 0 <= stamp_ns - self._frames[0][0] <= STEADY_TIME * NANOSECONDS:
             self._frames.popleft()
         expected = pose_in(self._frames[0][1], self._odometry)
         steady = not has_moved(expected, pose, STEADY_DISTANCE, STEADY_ANGLE)
         if steady and self.state is Localization.LOCALIZED:
-            self.changes.add(*self.result[:3], beams)
+            self.changes.add(*self._estimate[:3], beams)
         else:
             self.changes.forget()
 
@@ -452,8 +494,8 @@ class Localizer:
 
     def _publish(self, odometry: Pose) -> bool:
         estimate = self.filter.estimate()
-        if self._updated is not None and self.result is not None:
-            expected = pose_in(self.result.odometry_frame, odometry)
+        if self._updated is not None and self._estimate is not None:
+            expected = pose_in(self._estimate.odometry_frame, odometry)
             if has_moved(expected, estimate.pose, JUMP_DISTANCE, JUMP_ANGLE):
                 self._searching = True  # until the readings have fitted there for some time
             elif self.state is Localization.LOCALIZED:
@@ -465,7 +507,7 @@ class Localizer:
         if estimate.share < KNOWN_SHARE or self.silent:
             covariance = self.filter.spread(estimate.pose)
         frame = frame_between(estimate.pose, odometry)
-        self.result = LocalizedPose(self._stamp_ns, estimate.pose, covariance, frame)
+        self._estimate = LocalizedPose(self._stamp_ns, estimate.pose, covariance, frame)
         return True
 
     def _compare(self, beams: Beams) -> None:
@@ -505,9 +547,9 @@ class Localizer:
 
     def _explain(self, beams: Beams) -> Array:
         """Return which beams fit to the map at the estimate, and where, of those that tell."""
-        assert self.result is not None
+        assert self._estimate is not None
         found = np.empty((beams.reading.size, 3))
-        explain_readings(np.array(self.result.pose), self._field, beams, self._model, found)
+        explain_readings(np.array(self._estimate.pose), self._field, beams, self._model, found)
         fitting: Array = found[found[:, 0] != 0.0]
         return fitting
 
@@ -598,6 +640,7 @@ def warm_up(parameters: LocalizerParameters) -> None:
     small = map_of_grid(cells, max(0.1, parameters.robot_radius), (0.0, 0.0, 0.0))
     made = Localizer(parameters, small, np.zeros((1, 3)), (0.1, 0.8))
     made.scatter()
+    made._tracker.begin(ORIGIN, np.eye(3))
     for k in range(3):
         made.add_odometry(k, Pose(k * 2.0 * parameters.update_min_d, 0.0, 0.0))
         made.add_range(0, 0.5)
