@@ -146,6 +146,47 @@ def held(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
     return {'twist': link.kept}
 
 
+def late_twist(steps: int, *, linear: bool = True) -> Send:
+    """Return a twist that is late by some messages: both velocities, or the yaw rate alone."""
+
+    def changed(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
+        link.kept = [*(link.kept or ()), odometry.twist][-steps - 1 :]
+        first = link.kept[0]
+        return {'twist': first if linear else odometry.twist._replace(angular=first.angular)}
+
+    return with_odometry(changed)
+
+
+def filtered(time: float) -> Send:
+    """Return a twist behind a low-pass of first order (s)."""
+    share = -math.expm1(-1.0 / RATE / time)
+
+    def changed(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
+        last = link.kept or odometry.twist
+        pairs = zip(last, odometry.twist, strict=True)
+        link.kept = BodyTwist(*(old + share * (new - old) for old, new in pairs))
+        return {'twist': link.kept}
+
+    return with_odometry(changed)
+
+
+def late_pose(steps: int) -> Send:
+    """Return a pose that is late by some messages: that of a camera or a filter."""
+
+    def changed(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
+        link.kept = [*(link.kept or ()), odometry.pose][-steps - 1 :]
+        return {'pose': link.kept[0]}
+
+    return with_odometry(changed)
+
+
+def camera(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
+    """Return the pose of every tenth message: that of a camera of 10 Hz."""
+    if k % 10 == 0 or link.kept is None:
+        link.kept = odometry.pose
+    return {'pose': link.kept}
+
+
 def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
     """Return a fault of the pose in each report."""
     return with_odometry(
@@ -215,6 +256,13 @@ FAULTS: Mapping[str, Fault] = {
         send=with_odometry(lambda link, k, odometry: {'twist': STANDSTILL} if k % 2 else {})
     ),
     'twist of the odometry held for 50 ms': Fault(send=with_odometry(held)),
+    'twist of the odometry 30 ms late': Fault(send=late_twist(3)),
+    'twist of the odometry 80 ms late': Fault(send=late_twist(8)),
+    'twist of the odometry behind a filter of 0.2 s': Fault(send=filtered(0.2)),
+    'yaw rate of the odometry 50 ms late': Fault(send=late_twist(5, linear=False)),
+    'pose 100 ms late': Fault(send=late_pose(10)),
+    'pose 300 ms late': Fault(send=late_pose(30)),
+    'pose ten times a second': Fault(send=with_odometry(camera)),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
     ),

@@ -773,6 +773,7 @@ class Controller:
         """Return u (rad/s²), shape (2,), for the plan from ``begin`` to ``end`` (rad/s)."""
         tracker, speeds = self._tracker, self.actuation.predicted
         corrects_body = self.parameters.composition == 'body' and self.parameters.body.enabled
+        corrects_body = corrects_body and not self.odometry_twist.pose_is_late
         if self._ahead_ns == 0 and not corrects_body:
             return tracker.step(plan_ns, speeds, begin, end, elapsed)
         planned, rate = tracker.plan(plan_ns, begin, end, elapsed)
@@ -940,7 +941,10 @@ class Controller:
         elif not self.disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
-        if abs(dead_time - self._dead_time) > MIN_DEAD_TIME_CHANGE:
+        longer = dead_time - self._dead_time
+        if longer > MIN_DEAD_TIME_CHANGE and self.odometry_twist.may_be_late(longer):
+            return  # the pose will tell
+        if abs(longer) > MIN_DEAD_TIME_CHANGE:
             self._set_dead_time(dead_time)
 
     def _set_dead_time(self, dead_time: float) -> None:

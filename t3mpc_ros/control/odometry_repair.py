@@ -13,6 +13,7 @@
 # limitations under the License.
 """What is wrong with stamps and twist of the odometry, and what is used in their place."""
 
+from collections import deque
 import math
 from statistics import median
 
@@ -169,7 +170,7 @@ FIT_VARIANCE = 2.0  # variance of a fit over that with independent comparisons
 ALONE, OFFSETS = 1.5, 2.0
 """Square that a factor alone leaves, over that of the whole fit, up to which it is used; standard
 deviations before any comparison up to which an offset that leaves no more is as likely."""
-TWIST_CERTAIN, LATE_CERTAIN = 4.0, 3.3
+TWIST_CERTAIN, LATE_CERTAIN = 4.0, 4.0
 """Standard deviations of a deviation between twist and pose that counts."""
 TWIST_TOLERANCE, OFFSET_TOLERANCE = 0.05, 0.004
 """Deviation of the factor of the linear velocity from 1, and its offset (m/s), that count."""
@@ -178,6 +179,12 @@ ANGULAR_FACTORS = 0.5, 2.0
 LATE, LATE_PERIODS = 0.005, 0.6
 """Time by which the linear velocity is behind the pose that counts: s, and share of the interval
 of the messages, as the mean over two of them is half of it late."""
+EARLY_STEP, EARLY_STEPS, EARLY_ROWS, EARLY = 0.1, 4, 4, 0.3
+"""Delays with which the twist is compared, too (s, and their number); comparisons that are needed;
+and square that one of them leaves, over that of none, from which the pose is late, not the twist
+wrong: that of a camera or a filter."""
+FIRST_DRIVE = 2.0  # driving time (s) in which comparisons that are needed must have come
+HISTORY = 128  # messages whose twist is kept for that
 REPEATS_SHARE, REPEATS_MEMORY, REPEATS_ROWS = 0.2, 0.98, 20
 """Share by which the usual number of repetitions of a twist follows each one, forgetting factor of
 what is known of its changes, and how many must follow equal numbers of repetitions: 1 s at 20 Hz.
@@ -257,6 +264,14 @@ class VelocityFit:
         if rest_alone < ALONE * self._noise and not self._is_offset:
             self.values[0] = product / motion
             self.deviations[0] = math.sqrt(FIT_VARIANCE * max(rest_alone, self._least) / motion)
+
+    @property
+    def first_lag(self) -> float:
+        """Time by which the twist is late, from few comparisons, if nothing else is wrong, s."""
+        square = float(self._normal[1, 1])
+        if not square:
+            return 0.0
+        return float(self._product[1] - self._normal[0, 1]) / square
 
     @property
     def _is_offset(self) -> bool:
@@ -356,11 +371,14 @@ class TwistFit:
         """What is wrong with the twist otherwise; '' if nothing is."""
         self.uses_pose = [False, False]
         """Whether a velocity by the pose is the better one, to be used where something is."""
-        self._late = False  # whether it was at the last comparison
+        self._late = [False, False]  # whether the velocities were at the last comparison
         self._fits = [
             VelocityFit(prior, noise) for prior, noise in zip(FIT_PRIOR, FIT_NOISE, strict=True)
         ]
         self._held = HeldTwist()
+        self._shifted = [0.0] * (EARLY_STEPS + 1)
+        """Squared differences of the pose from the twist, by delays of the twist, (m/s)²."""
+        self.driven = 0.0  # time for which the twist has been that of a robot that moves, s
         self._aside = self._interval = 0.0
         self._age = 0.0  # driving time since something was wrong, s
         self.interrupt()
@@ -371,6 +389,8 @@ class TwistFit:
         """Of each velocity both stages of the filter, and their sums since the last comparison."""
         self._last: list[float] = []
         self._from: State | None = None
+        self._history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
+        """Twists behind both stages of the filter."""
         self._held_for, self._held_way = 0.0, [0.0, 0.0]
         """Time for which the pose has been the same (s), and way by the twist since then."""
 
@@ -422,6 +442,7 @@ class TwistFit:
             second += share * (first - second)
             # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
             stages[:] = first, second, sum_first + elapsed * first, sum_second + elapsed * second
+        self._history.append((self._stages[2][1], self._stages[3][1]))
         changes = zip(self._rough, given, self._last, strict=False)
         self._rough[:] = [each + 0.5 * (now - before) ** 2 for each, now, before in changes]
         self._held.update(self._last, given)
@@ -456,6 +477,7 @@ class TwistFit:
             fit.add(row, means[i + 2][1], rough)
         kept = 1.0 - FIT_ROW / FIT_MEMORY
         self._aside = kept * self._aside + means[4][1] ** 2
+        self._shift(kept)
         self._age += FIT_ROW
         known = self._fits[0].rows >= FIT_ROWS or any(fit.is_reversed for fit in self._fits)
         if known or self._held.is_late(self._interval):
@@ -468,23 +490,53 @@ class TwistFit:
             if not any(self.uses_pose):
                 self.wrong = ''
 
+    def _shift(self, kept: float) -> None:
+        """Compare the pose with the twist of earlier times."""
+        step = round(EARLY_STEP / self._interval)
+        if not 0 < step * EARLY_STEPS < len(self._history):
+            return
+        for i in range(EARLY_STEPS + 1):
+            linear, angular = self._history[-1 - i * step]
+            apart = self._stages[0][1] - linear, STAMP_ARM * (self._stages[1][1] - angular)
+            self._shifted[i] = kept * self._shifted[i] + apart[0] ** 2 + apart[1] ** 2
+
+    @property
+    def pose_lateness(self) -> float:
+        """Time after which the pose says what the twist has said, s; 0 if that is no better."""
+        least = min(self._shifted)
+        known = round(self._fits[0].rows) >= EARLY_ROWS and least < EARLY * self._shifted[0]
+        return EARLY_STEP * self._shifted.index(least) if known else 0.0
+
+    def may_be_late(self, time: float) -> bool:
+        """Whether a velocity is more likely late by ``time`` (s) than not at all."""
+        if round(self._fits[0].rows) < REVERSED_ROWS:
+            return self.driven < FIRST_DRIVE
+        return any(fit.first_lag > 0.5 * time for fit in self._fits)
+
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
         linear, angular = self._fits
+        if self.pose_lateness:
+            return '', 1.0
         factor, lag, offset = linear.values
         turns, (least, most) = angular.values[0], ANGULAR_FACTORS
         way = max(linear.motion, FIT_MOTION[0] ** 2)
         scaled = abs(factor - 1.0) > TWIST_TOLERANCE and linear.is_certain(0, TWIST_CERTAIN)
         shifted = abs(offset) > OFFSET_TOLERANCE and linear.is_certain(2, TWIST_CERTAIN)
-        late = lag > max(LATE, LATE_PERIODS * self._interval)
-        late = late and linear.is_certain(1, LATE_CERTAIN)
-        late, self._late = late and self._late, late  # twice: of many decisions one may be wrong
+        behind = [
+            fit.values[1] > max(LATE, LATE_PERIODS * self._interval)
+            and fit.is_certain(1, LATE_CERTAIN)
+            for fit in self._fits
+        ]
+        # Twice: of many decisions one may be wrong.
+        late, turns_late = map(all, zip(behind, self._late, strict=True))
+        self._late = behind
         follows = linear.unexplained < UNLIKE[0] ** 2 * way and linear.roughness < ROUGH**2 * way
         wrong, common, interval = '', 1.0, self._interval
         if self._held.is_late(interval):
-            behind = self._held.late(interval)
-            held = 2.0 * behind + interval
-            wrong = f'its velocities are held for {held:.2g} s, {behind:.3f} s behind'
+            mean = self._held.late(interval)
+            held = 2.0 * mean + interval
+            wrong = f'its velocities are held for {held:.2g} s, {mean:.3f} s behind'
         # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
         elif self._aside > SIDEWAYS**2 * linear.rows * linear.motion:
             pass
@@ -500,6 +552,8 @@ class TwistFit:
             common = factor
         elif scaled:
             wrong = f'its linear velocity is {factor:.3f} times'
+        if not wrong and turns_late:
+            wrong = f'its angular velocity is {angular.values[1]:.3f} s behind'
         if not wrong and not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
             wrong = f'its angular velocity is {turns:.3f} times'
         if wrong and any(self.uses_pose):
@@ -687,6 +741,15 @@ class OdometryTwist:
         """Speeds by the change of the pose since the last message, m/s and rad/s."""
         return self._by_pose.speeds
 
+    @property
+    def pose_is_late(self) -> bool:
+        """Whether the pose is that of an earlier time than the twist."""
+        return self._fit.pose_lateness > 0.0
+
+    def may_be_late(self, time: float) -> bool:
+        """Whether a velocity that is used is more likely late by ``time`` (s) than not at all."""
+        return not self.replaced and self._fit.may_be_late(time)
+
     def reject(self) -> None:
         """Use the pose: by it the robot follows its commands, by the twist it does not."""
         self._fit.reject()
@@ -720,6 +783,11 @@ class OdometryTwist:
                 'used in its place: correct the velocities in the driver of the robot, or see why '
                 'its wheels spin'
             )
+        if late := self._fit.pose_lateness:
+            return (
+                f'the pose in odom says {late:.1f} s later what its twist says, no turn is '
+                'corrected by it: stamp the pose with the time of its measurement'
+            )
         if self._fit.factor == 1.0:
             return ''
         return (
@@ -742,6 +810,10 @@ class OdometryTwist:
             odometry = odometry._replace(twist=BodyTwist(*by_pose))
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
+            moves = any(
+                abs(v) > least for v, least in zip(odometry.twist, FIT_MOTION, strict=True)
+            )
+            self._fit.driven += moves * (elapsed or 0.0)
             if last is not None and motion is not None:
                 self._units.update(last, odometry, motion)
         else:

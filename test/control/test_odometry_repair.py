@@ -291,7 +291,7 @@ WRONG = {
 
 
 def contradicted(
-    changed, *, seed=1, seconds=20.0, noise=(0.005, 0.06), moved=None, motion=turning
+    changed, *, seed=1, seconds=20.0, noise=(0.005, 0.06), moved=None, motion=turning, watch=None
 ):
     """Return twist monitor and the errors of the used twists, of a drive with a false twist."""
     generator, twist, errors = np.random.default_rng(seed), OdometryTwist(), []
@@ -306,6 +306,8 @@ def contradicted(
             State(k * 10 * MS, seen, BodyTwist(*given.tolist())), restart=k == 0
         ).twist
         errors.append(np.array(used) - history[-1])
+        if watch:
+            watch(twist)
     return twist, np.array(errors)
 
 
@@ -478,6 +480,7 @@ def test_a_twist_that_is_equal_for_another_reason_is_not_held(repeated, late):
 SEEN = {
     'as it is': lambda k, pose, generator: pose,
     '100 ms later': lambda k, pose, generator: pose,
+    '300 ms later': lambda k, pose, generator: pose,
     'noise': lambda k, pose, generator: Pose(
         *(np.array(pose) + generator.standard_normal(3) * (0.005, 0.005, 0.01)).tolist()
     ),
@@ -501,12 +504,51 @@ def test_a_pose_that_is_late_or_rough_replaces_no_twist(seen, seed):
         poses.append(pose)
         if change is None:
             return poses[k - k % 10]
-        late = 10 if seen.startswith('100 ms') else 0
+        late = int(seen.split()[0]) // 10 if seen.endswith('later') else 0
         return change(k, poses[max(k - late, 0)], generator)
 
     twist, _ = contradicted(delayed(0), seed=seed, seconds=30.0, moved=moved)
     assert not twist.replaced
-    assert twist.problem() == ''
+    assert twist.pose_is_late == seen.endswith('later')
+    assert ('s later what its twist says' in twist.problem()) == twist.pose_is_late
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_yaw_rate_that_is_late_is_replaced(seed):
+    """It was taken for the dead time of the robot: ten times the error."""
+
+    def changed(k, pose, history):
+        return history[k][0], history[max(k - 5, 0)][1]
+
+    twist, errors = contradicted(changed, seed=seed)
+    assert twist.problem().startswith('the twist in odom is wrong: its angular velocity is 0.0')
+    assert np.sqrt(np.mean(errors[1000:, 1] ** 2)) < 0.1
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('late', [0, 3, 8])
+def test_a_dead_time_waits_for_the_pose_to_tell(late, seed):
+    """A twist that is late was a longer dead time of the robot for two to four seconds."""
+    told = []
+    contradicted(
+        delayed(late),
+        seed=seed,
+        watch=lambda twist: told.append(twist.may_be_late(0.01 * (late or 3))),
+    )
+    assert all(told[:100])  # nothing is known yet
+    if late:
+        first = told.index(False)  # as the pose is used from here on
+        assert first > 150
+    else:
+        assert not any(told[400:])
+
+
+def test_a_dead_time_does_not_wait_for_a_pose_that_tells_nothing():
+    twist, told = OdometryTwist(), []
+    for k in range(400):
+        twist.measured(State(k * 10 * MS, START, BodyTwist(0.1, 0.0)), restart=k == 0)
+        told.append(twist.may_be_late(0.05))
+    assert [told[150], told[250]] == [True, False]
 
 
 def test_a_twist_that_was_wrong_is_used_again():
