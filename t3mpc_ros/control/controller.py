@@ -599,7 +599,7 @@ class Controller:
             self._snapshots.clear()
         elif not self._is_responsive(speeds):
             by_pose = self._twist_believed and self._pose_response.responsive
-            if not (followed and by_pose):
+            if not (followed and by_pose and twist.pose_is_prompt):
                 return self._command_unresponsive(odometry, dt)
             twist.reject()  # from the next message on
             self._reset_response()

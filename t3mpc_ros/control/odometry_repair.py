@@ -746,6 +746,11 @@ class OdometryTwist:
         """Whether the pose is that of an earlier time than the twist."""
         return self._fit.pose_lateness > 0.0
 
+    @property
+    def pose_is_prompt(self) -> bool:
+        """Whether the pose is new in each message, and of its time, as far as is known."""
+        return not (self._by_pose.holds or self.pose_is_late)
+
     def may_be_late(self, time: float) -> bool:
         """Whether a velocity that is used is more likely late by ``time`` (s) than not at all."""
         return not self.replaced and self._fit.may_be_late(time)
@@ -824,7 +829,7 @@ class OdometryTwist:
                 if has_moved(last.pose, pose, *farthest):  # it cannot have driven so far
                     # That of the next message: this one may be the only one so far off.
                     self._anchor = None
-            if self._anchor is not None:
+            if self._anchor is not None and not self.pose_is_late:
                 self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if last is None or motion is None or self.missing or self._units.wrong:
             self._fit.interrupt()

@@ -46,7 +46,7 @@ from t3mpc_ros.control.velocity_command import (
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
-from t3mpc_ros.geometry.kinematics import wheels_from_twist
+from t3mpc_ros.geometry.kinematics import advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 
 pytestmark = pytest.mark.compiled
@@ -76,6 +76,57 @@ class GapLoop(ServoLoop):
         self.delayed = self.twist
         self.now += PERIOD
         return status
+
+
+POSES = {
+    'prompt': lambda poses: poses[-1],
+    'of a camera, 10 Hz': lambda poses: poses[(len(poses) - 1) // 10 * 10],
+    '100 ms late': lambda poses: poses[max(len(poses) - 11, 0)],
+}
+
+
+def drive(pose, twist=lambda given, held: given, blocked=False):
+    """Return reasons after 5 s, and the controller, of a robot that does what it is told.
+
+    ``twist``: of the odometry from 5 s on, by the true one and that of 5 s; ``blocked``: it stands
+    """
+    controller, command, place = Controller(StepperControllerParameters()), STANDSTILL, ORIGIN
+    poses, reasons, held = [], [], STANDSTILL
+    for k in range(560):
+        for ahead in range(40 if k == 0 else 1):
+            at = k + 39 * (k > 0) + ahead
+            time = 0.01 * at
+            reference = BodyTwist(0.12 + 0.06 * np.sin(2.0 * time), 0.8 * np.sin(3.0 * time))
+            controller.add_reference(State(at * PERIOD, ORIGIN, reference))
+        true = STANDSTILL if blocked and k >= 500 else command
+        place = advance_pose(place, true, 0.01)
+        poses.append(place)
+        held = true if k <= 500 else held
+        given = twist(true, held) if k > 500 else true
+        command, status = controller.step(State(k * PERIOD, pose(poses), given))
+        reasons.append(status.reason)
+    return reasons[500:], controller
+
+
+@pytest.mark.parametrize('pose', POSES)
+def test_a_robot_that_is_blocked_follows_nothing_by_any_pose(pose):
+    """The pose of a camera goes on for a tenth of a second: it says nothing of the twist."""
+    reasons, controller = drive(POSES[pose], blocked=True)
+    assert Reason.NOT_FOLLOWING in reasons[:20]
+    assert not controller.odometry_twist.replaced
+
+
+@pytest.mark.parametrize('pose', POSES)
+def test_a_twist_that_leaves_the_commands_is_wrong_where_the_pose_follows(pose):
+    """It was a robot that does not follow, commanded without shaping until the twist was known."""
+
+    def frozen_turning(given, held):
+        return BodyTwist(given.linear, held.angular + 2.0)
+
+    reasons, controller = drive(POSES[pose], frozen_turning)
+    prompt = pose == 'prompt'
+    assert controller.odometry_twist.replaced == prompt
+    assert (Reason.NOT_FOLLOWING in reasons) != prompt
 
 
 def test_a_known_robot_follows_through_a_gap_as_without_one():
