@@ -811,7 +811,7 @@ class OdometryTwist:
         motion = None if last is None else motion_between(last.pose, pose)
         elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
         by_pose = self._by_pose.update(odometry, elapsed, motion)
-        if self._blanks.has(odometry) and last is not None:
+        if (self._blanks.has(odometry) or self._blanks.known) and last is not None:
             odometry = odometry._replace(twist=BodyTwist(*by_pose))
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
