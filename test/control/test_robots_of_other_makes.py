@@ -117,7 +117,7 @@ def test_a_robot_that_is_blocked_follows_nothing_by_any_pose(pose):
 
 
 @pytest.mark.parametrize('pose', POSES)
-def test_a_twist_that_leaves_the_commands_is_wrong_where_the_pose_follows(pose):
+def test_a_twist_is_wrong_where_the_pose_follows_the_commands(pose):
     """It was a robot that does not follow, commanded without shaping until the twist was known."""
 
     def frozen_turning(given, held):
