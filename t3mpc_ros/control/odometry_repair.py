@@ -183,7 +183,9 @@ EARLY_STEP, EARLY_STEPS, EARLY_ROWS, EARLY = 0.1, 4, 4, 0.3
 """Delays with which the twist is compared, too (s, and their number); comparisons that are needed;
 and square that one of them leaves, over that of none, from which the pose is late, not the twist
 wrong: that of a camera or a filter."""
-FIRST_DRIVE = 2.0  # driving time (s) in which comparisons that are needed must have come
+LAG_EVIDENCE, ONE_EVIDENCE, FIRST_DRIVE = 2.0, 10.0, 2.0
+"""Logarithm of the ratio of likelihoods from which the twist is late rather than the robot, or one
+velocity alone, and time of driving (s) in which the comparisons for that must have come."""
 HISTORY = 128  # messages whose twist is kept for that
 REPEATS_SHARE, REPEATS_MEMORY, REPEATS_ROWS = 0.2, 0.98, 20
 """Share by which the usual number of repetitions of a twist follows each one, forgetting factor of
@@ -265,13 +267,11 @@ class VelocityFit:
             self.values[0] = product / motion
             self.deviations[0] = math.sqrt(FIT_VARIANCE * max(rest_alone, self._least) / motion)
 
-    @property
-    def first_lag(self) -> float:
-        """Time by which the twist is late, from few comparisons, if nothing else is wrong, s."""
+    def evidence_of_lag(self, time: float) -> float:
+        """Return the log likelihood ratio of a twist late by a time (s) to one that fits."""
         square = float(self._normal[1, 1])
-        if not square:
-            return 0.0
-        return float(self._product[1] - self._normal[0, 1]) / square
+        product = float(self._product[1] - self._normal[0, 1])
+        return time * (product - 0.5 * time * square) / (FIT_VARIANCE * self._noise)
 
     @property
     def _is_offset(self) -> bool:
@@ -508,10 +508,11 @@ class TwistFit:
         return EARLY_STEP * self._shifted.index(least) if known else 0.0
 
     def may_be_late(self, time: float) -> bool:
-        """Whether a velocity is more likely late by ``time`` (s) than not at all."""
+        """Whether the twist is more likely late by ``time`` (s) than not at all."""
         if round(self._fits[0].rows) < REVERSED_ROWS:
             return self.driven < FIRST_DRIVE
-        return any(fit.first_lag > 0.5 * time for fit in self._fits)
+        both = [fit.evidence_of_lag(time) for fit in self._fits]
+        return sum(both) > LAG_EVIDENCE or max(both) > ONE_EVIDENCE
 
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
@@ -752,7 +753,7 @@ class OdometryTwist:
         return not (self._by_pose.holds or self.pose_is_late)
 
     def may_be_late(self, time: float) -> bool:
-        """Whether a velocity that is used is more likely late by ``time`` (s) than not at all."""
+        """Whether a twist that is used is more likely late by ``time`` (s) than not at all."""
         return not self.replaced and self._fit.may_be_late(time)
 
     def reject(self) -> None:
