@@ -139,22 +139,40 @@ def of_the_world(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
     return {'twist': BodyTwist(linear * math.cos(odometry.pose.yaw), angular)}
 
 
-def held(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
-    """Return the twist of every fifth message: that of a stream of 20 Hz."""
-    if k % 5 == 0 or link.kept is None:
-        link.kept = odometry.twist
-    return {'twist': link.kept}
+def held(name: str, count: int) -> Send:
+    """Return reports with a part of the odometry, 'twist' or 'pose', of every so many messages."""
 
-
-def late_twist(steps: int, *, linear: bool = True) -> Send:
-    """Return a twist that is late by some messages: both velocities, or the yaw rate alone."""
-
-    def changed(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
-        link.kept = [*(link.kept or ()), odometry.twist][-steps - 1 :]
-        first = link.kept[0]
-        return {'twist': first if linear else odometry.twist._replace(angular=first.angular)}
+    def changed(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
+        if k % count == 0 or link.kept is None:
+            link.kept = getattr(odometry, name)
+        return {name: link.kept}
 
     return with_odometry(changed)
+
+
+def delayed(steps: int, change: Callable[[State, State], Mapping[str, Any]]) -> Send:
+    """Return reports with a change of the odometry by that of some messages before and itself."""
+
+    def changed(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
+        link.kept = [*(link.kept or ()), odometry][-steps - 1 :]
+        return change(link.kept[0], odometry)
+
+    return with_odometry(changed)
+
+
+def late_twist(before: State, now: State) -> Mapping[str, Any]:
+    """Return the twist of a message before."""
+    return {'twist': before.twist}
+
+
+def late_yaw_rate(before: State, now: State) -> Mapping[str, Any]:
+    """Return the twist with the yaw rate of a message before."""
+    return {'twist': now.twist._replace(angular=before.twist.angular)}
+
+
+def late_pose(before: State, now: State) -> Mapping[str, Any]:
+    """Return the pose of a message before."""
+    return {'pose': before.pose}
 
 
 def filtered(time: float) -> Send:
@@ -168,23 +186,6 @@ def filtered(time: float) -> Send:
         return {'twist': link.kept}
 
     return with_odometry(changed)
-
-
-def late_pose(steps: int) -> Send:
-    """Return a pose that is late by some messages: that of a camera or a filter."""
-
-    def changed(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
-        link.kept = [*(link.kept or ()), odometry.pose][-steps - 1 :]
-        return {'pose': link.kept[0]}
-
-    return with_odometry(changed)
-
-
-def camera(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
-    """Return the pose of every tenth message: that of a camera of 10 Hz."""
-    if k % 10 == 0 or link.kept is None:
-        link.kept = odometry.pose
-    return {'pose': link.kept}
 
 
 def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
@@ -255,14 +256,14 @@ FAULTS: Mapping[str, Fault] = {
     'no twist in every second message': Fault(
         send=with_odometry(lambda link, k, odometry: {'twist': STANDSTILL} if k % 2 else {})
     ),
-    'twist of the odometry held for 50 ms': Fault(send=with_odometry(held)),
-    'twist of the odometry 30 ms late': Fault(send=late_twist(3)),
-    'twist of the odometry 80 ms late': Fault(send=late_twist(8)),
+    'twist of the odometry held for 50 ms': Fault(send=held('twist', 5)),
+    'twist of the odometry 30 ms late': Fault(send=delayed(3, late_twist)),
+    'twist of the odometry 80 ms late': Fault(send=delayed(8, late_twist)),
     'twist of the odometry behind a filter of 0.2 s': Fault(send=filtered(0.2)),
-    'yaw rate of the odometry 50 ms late': Fault(send=late_twist(5, linear=False)),
-    'pose 100 ms late': Fault(send=late_pose(10)),
-    'pose 300 ms late': Fault(send=late_pose(30)),
-    'pose ten times a second': Fault(send=with_odometry(camera)),
+    'yaw rate of the odometry 50 ms late': Fault(send=delayed(5, late_yaw_rate)),
+    'pose 100 ms late': Fault(send=delayed(10, late_pose)),
+    'pose 300 ms late': Fault(send=delayed(30, late_pose)),
+    'pose ten times a second': Fault(send=held('pose', 10)),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
     ),

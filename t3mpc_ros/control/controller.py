@@ -943,7 +943,7 @@ class Controller:
             self._before_disturbance = None
         longer = dead_time - self._dead_time
         if longer > MIN_DEAD_TIME_CHANGE and self.odometry_twist.may_be_late(longer):
-            return  # the pose will tell
+            return  # comparisons with the pose decide that first
         if abs(longer) > MIN_DEAD_TIME_CHANGE:
             self._set_dead_time(dead_time)
 

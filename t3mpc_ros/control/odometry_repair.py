@@ -183,10 +183,10 @@ EARLY_STEP, EARLY_STEPS, EARLY_ROWS, EARLY = 0.1, 4, 4, 0.3
 """Delays with which the twist is compared, too (s, and their number); comparisons that are needed;
 and square that one of them leaves, over that of none, from which the pose is late, not the twist
 wrong: that of a camera or a filter."""
+HISTORY = 401  # messages whose twist is kept for the delays, at the largest rate of 1000 Hz
 LAG_EVIDENCE, ONE_EVIDENCE, FIRST_DRIVE = 2.0, 10.0, 2.0
 """Logarithm of the ratio of likelihoods from which the twist is late rather than the robot, or one
 velocity alone, and time of driving (s) in which the comparisons for that must have come."""
-HISTORY = 128  # messages whose twist is kept for that
 REPEATS_SHARE, REPEATS_MEMORY, REPEATS_ROWS = 0.2, 0.98, 20
 """Share by which the usual number of repetitions of a twist follows each one, forgetting factor of
 what is known of its changes, and how many must follow equal numbers of repetitions: 1 s at 20 Hz.

@@ -398,7 +398,8 @@ class Localizer:
             return True
         since = 0.0 if last is None else min((stamp_ns - last_ns) / NANOSECONDS, DISORDER)
         self.silence += since
-        self._tracker.predict(last or pose, pose, since)
+        if self._tracker.active:
+            self._tracker.predict(last or pose, pose, since)
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters

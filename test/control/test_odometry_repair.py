@@ -527,28 +527,41 @@ def test_a_yaw_rate_that_is_late_is_replaced(seed):
 
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('late', [0, 3, 8])
-def test_a_dead_time_waits_for_the_pose_to_tell(late, seed):
+def test_a_dead_time_waits_for_the_pose(late, seed):
     """A twist that is late was a longer dead time of the robot for two to four seconds."""
-    told = []
+    waits = []
     contradicted(
         delayed(late),
         seed=seed,
-        watch=lambda twist: told.append(twist.may_be_late(0.01 * (late or 3))),
+        watch=lambda twist: waits.append(twist.may_be_late(0.01 * (late or 3))),
     )
-    assert all(told[:100])  # nothing is known yet
+    assert all(waits[:100])  # nothing is known yet
     if late:
-        first = told.index(False)  # as the pose is used from here on
+        first = waits.index(False)  # as the pose is used from here on
         assert first > 150
     else:
-        assert not any(told[400:])
+        assert not any(waits[400:])
 
 
-def test_a_dead_time_does_not_wait_for_a_pose_that_tells_nothing():
-    twist, told = OdometryTwist(), []
+def test_a_dead_time_does_not_wait_for_a_pose_that_says_nothing():
+    twist, waits = OdometryTwist(), []
     for k in range(400):
         twist.measured(State(k * 10 * MS, START, BodyTwist(0.1, 0.0)), restart=k == 0)
-        told.append(twist.may_be_late(0.05))
-    assert [told[150], told[250]] == [True, False]
+        waits.append(twist.may_be_late(0.05))
+    assert [waits[150], waits[250]] == [True, False]
+
+
+@pytest.mark.parametrize('rate', [20, 200, 500, 1000])
+def test_a_late_pose_is_found_at_every_rate(rate):
+    """From 320 Hz on its twist was replaced: twists of earlier times were kept by their number."""
+    twist, poses, steps = OdometryTwist(), [START], round(0.3 * rate)
+    for k in range(10 * rate):
+        used = BodyTwist(*winding(k / rate))
+        poses.append(advance_pose(poses[-1], used, 1.0 / rate))
+        stamp_ns = round(k * NANOSECONDS / rate)
+        twist.measured(State(stamp_ns, poses[max(k - steps, 0)], used), restart=k == 0)
+    assert twist.pose_is_late
+    assert not twist.replaced
 
 
 def test_a_twist_that_was_wrong_is_used_again():

@@ -85,13 +85,13 @@ POSES = {
 }
 
 
-def drive(pose, twist=lambda given, held: given, blocked=False):
-    """Return reasons after 5 s, and the controller, of a robot that does what it is told.
+def drive(pose, twist=lambda given, before: given, blocked=False):
+    """Return reasons after 5 s, and the controller, of a robot that follows its commands.
 
     ``twist``: of the odometry from 5 s on, by the true one and that of 5 s; ``blocked``: it stands
     """
     controller, command, place = Controller(StepperControllerParameters()), STANDSTILL, ORIGIN
-    poses, reasons, held = [], [], STANDSTILL
+    poses, reasons, before = [], [], STANDSTILL
     for k in range(560):
         for ahead in range(40 if k == 0 else 1):
             at = k + 39 * (k > 0) + ahead
@@ -101,8 +101,8 @@ def drive(pose, twist=lambda given, held: given, blocked=False):
         true = STANDSTILL if blocked and k >= 500 else command
         place = advance_pose(place, true, 0.01)
         poses.append(place)
-        held = true if k <= 500 else held
-        given = twist(true, held) if k > 500 else true
+        before = true if k <= 500 else before
+        given = twist(true, before) if k > 500 else true
         command, status = controller.step(State(k * PERIOD, pose(poses), given))
         reasons.append(status.reason)
     return reasons[500:], controller
@@ -120,8 +120,8 @@ def test_a_robot_that_is_blocked_follows_nothing_by_any_pose(pose):
 def test_a_twist_is_wrong_where_the_pose_follows_the_commands(pose):
     """It was a robot that does not follow, commanded without shaping until the twist was known."""
 
-    def frozen_turning(given, held):
-        return BodyTwist(given.linear, held.angular + 2.0)
+    def frozen_turning(given, before):
+        return BodyTwist(given.linear, before.angular + 2.0)
 
     reasons, controller = drive(POSES[pose], frozen_turning)
     prompt = pose == 'prompt'
