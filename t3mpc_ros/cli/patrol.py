@@ -62,7 +62,8 @@ def add_parser(commands: shared_options.Commands) -> None:
         metavar=('LEFT', 'BOTTOM', 'RIGHT', 'TOP'),
         help='where the paths lie, around the start at 0 0, m (default -1.75 -1.25 1.75 1.25)',
     )
-    add('--paths', nargs='+', default=(), metavar='PATH', help='by name (default: all)')
+    text = 'by name (default: all); with --localization its cases'
+    add('--paths', nargs='+', default=(), metavar='PATH', help=text)
     text = (
         'instead: how exactly the simulated robot follows a straight line, a square, a '
         'figure of eight and a recorded path, with and without each part of the controller and '
@@ -153,7 +154,8 @@ def _safety(options: argparse.Namespace) -> int:
 def _compare_localizations(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.patrol import localization_study as study
 
-    plan = study.LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
+    cases = options.paths or tuple(study.CASES)
+    plan = study.LocalizationPlan(cases, options.seeds, 60.0 * options.minutes)
     runs = options.output / f'localization{RUNS}'
     measure = partial(study.compare_localizations, plan, runs)
     return _print_table(options, measure, partial(study.markdown, plan))

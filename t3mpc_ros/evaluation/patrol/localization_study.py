@@ -34,6 +34,7 @@ from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import ON_PATH, RATE, Record, spans_of
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.parameters.table import find_names
 
 CARRIED_AT = 30.0
 """When the robot is carried, s."""
@@ -74,6 +75,7 @@ class LocalizationPlan:
     """Known room: a name or a file."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'cases', find_names('case', self.cases, CASES))
         if self.duration < CARRIED_AT + FOUND_WITHIN:
             raise ValueError(
                 f'duration must be at least {CARRIED_AT + FOUND_WITHIN:g} s, so that a robot that '
