@@ -378,6 +378,9 @@ class TwistFit:
         self._held = HeldTwist()
         self._shifted = [0.0] * (EARLY_STEPS + 1)
         """Squared differences of the pose from the twist, by delays of the twist, (m/s)²."""
+        self._products = [[0.0] * 3 for _ in range(2)]
+        """Of each velocity: squares of the rate of the pose and of the twist, and product, (m/s)².
+        """
         self.driven = 0.0  # time for which the twist has been that of a robot that moves, s
         self._aside = self._interval = 0.0
         self._age = 0.0  # driving time since something was wrong, s
@@ -499,6 +502,11 @@ class TwistFit:
             linear, angular = self._history[-1 - i * step]
             apart = self._stages[0][1] - linear, STAMP_ARM * (self._stages[1][1] - angular)
             self._shifted[i] = kept * self._shifted[i] + apart[0] ** 2 + apart[1] ** 2
+        for i, sums in enumerate(self._products):
+            arm = STAMP_ARM if i else 1.0
+            rate, twist = arm * self._stages[i][1], arm * self._history[-1][i]
+            each = rate**2, twist**2, rate * twist
+            sums[:] = (kept * old + new for old, new in zip(sums, each, strict=True))
 
     @property
     def pose_lateness(self) -> float:
@@ -506,6 +514,15 @@ class TwistFit:
         least = min(self._shifted)
         known = round(self._fits[0].rows) >= EARLY_ROWS and least < EARLY * self._shifted[0]
         return EARLY_STEP * self._shifted.index(least) if known else 0.0
+
+    @property
+    def pose_is_scaled(self) -> bool:
+        """Whether factors of the twist explain it nearly as well as a late pose.
+
+        While a robot gets faster, what it will do is what it does, times a factor.
+        """
+        scaled = sum(rate - both**2 / max(twist, 1e-12) for rate, twist, both in self._products)
+        return EARLY * scaled < min(self._shifted)
 
     def may_be_late(self, time: float) -> bool:
         """Whether the twist is more likely late by ``time`` (s) than not at all."""
@@ -565,8 +582,7 @@ class TwistFit:
         """Whether the angular velocity has the factor of the linear one, as far as is known."""
         linear, angular = self._fits
         half, uncertain = 0.5 * abs(factor - 1.0), TWIST_CERTAIN * angular.deviations[0]
-        known = uncertain < half or angular.motion < FIT_MOTION[1] ** 2
-        known = known or self.factor != 1.0 or not self.uses_pose[0]
+        known = uncertain < half or self.factor != 1.0 or not self.uses_pose[0]
         return known and abs(angular.values[0] - factor) < half + uncertain
 
 
@@ -789,7 +805,8 @@ class OdometryTwist:
                 'used in its place: correct the velocities in the driver of the robot, or see why '
                 'its wheels spin'
             )
-        if late := self._fit.pose_lateness:
+        late = self._fit.pose_lateness
+        if late and not self._fit.pose_is_scaled:
             return (
                 f'the pose in odom says {late:.1f} s later what its twist says, no turn is '
                 'corrected by it: stamp the pose with the time of its measurement'

@@ -513,6 +513,32 @@ def test_a_pose_that_is_late_or_rough_replaces_no_twist(seen, seed):
     assert ('s later what its twist says' in twist.problem()) == twist.pose_is_late
 
 
+@pytest.mark.parametrize('factors', [(1.1, 1.1), (1.2, 1.0)])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_twist_too_large_of_a_robot_that_sets_off_makes_no_pose_late(factors, seed):
+    """It is what the pose says a little later; the text named the pose in the first seconds."""
+    texts = set()
+    contradicted(
+        lambda k, pose, history: tuple(np.multiply(history[k], factors)),
+        motion=lambda time: (0.1 * math.exp(time - 4.0), 0.2 * math.exp(time - 4.0)),
+        watch=lambda twist: texts.add(twist.problem()),
+        seconds=5.0,
+        seed=seed,
+    )
+    assert not [text for text in texts if 'later' in text]
+
+
+def test_a_factor_of_a_straight_way_is_not_that_of_the_turns():
+    """The yaw rate was divided by it in the first turn: three times the settled error."""
+    twist, errors = contradicted(
+        lambda k, pose, history: (1.2 * history[k][0], history[k][1]),
+        noise=(0.001, 0.01),
+        motion=lambda time: (0.2 + 0.1 * math.sin(time), 2.0 * (time > 8.0)),
+        seconds=9.0,
+    )
+    assert np.abs(errors[500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.05)
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_yaw_rate_that_is_late_is_replaced(seed):
     """It was taken for the dead time of the robot: ten times the error."""
