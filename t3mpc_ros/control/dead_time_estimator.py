@@ -55,9 +55,10 @@ GRID_SIZE = 31
 PRIOR_DEVIATION = 0.03  # standard deviation of the configured dead time, s
 IDENTIFIED_DEVIATION = 0.005
 """Standard deviation at and below which the dead time is identified, s."""
-USED_DIFFERENCE, USED_EVIDENCE = 0.004, 7.0
+USED_DIFFERENCE, USED_EVIDENCE, LINEAR_EVIDENCE = 0.004, 7.0, 2.0
 """Difference (s), and likelihood ratio, 2 log, up to which the configured dead time is kept: so
-much the estimate is off if the drive responds otherwise than the lag describes."""
+much the estimate is off if the drive responds otherwise than the lag describes; and the ratio, of
+the mean of both wheels alone, from which it is kept against them: only the yaw rate is late."""
 MIN_DEVIATION = 0.0005
 """Standard deviation at which older data is forgotten as newer data is accepted, s."""
 UNCERTAINTY_FACTOR = 2.0
@@ -128,6 +129,7 @@ EVIDENCE = np.dtype(
         np.record,
         [
             ('costs', 'f8', GRID_SIZE),  # of each dead time of the grid: errors² / their variance
+            ('linear', 'f8', GRID_SIZE),  # the same of the mean of both wheels
             ('duration', 'f8'),  # s
             ('count', 'f8'),  # number of speeds
             ('information', 'f8'),  # Fisher information, 1/s²
@@ -227,7 +229,9 @@ class DeadTimeEstimator:
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
         self._update, self._evidence = TypedKernel(update_dead_time), TypedKernel(evidence_against)
+        self._linear = TypedKernel(linear_evidence)
         self.evidence_against(prior)  # compiles it, which no step has to
+        self._linear(self._state, prior, prior)
         self.reset(np.zeros(2))
 
     @property
@@ -248,8 +252,11 @@ class DeadTimeEstimator:
         # Neither is enough: the costs of a few blocks, or at the end of the grid, are no parabola.
         if abs(dead_time - self._configured) <= least:
             return self._configured
-        clear = self.evidence_against(self._configured + self.lateness) > USED_EVIDENCE
-        return dead_time if clear else self._configured
+        configured = self._configured + self.lateness
+        clear = self.evidence_against(configured) > USED_EVIDENCE
+        if clear and self._linear(self._state, self.dead_time, configured) < LINEAR_EVIDENCE:
+            return dead_time
+        return self._configured
 
     @property
     def standard_deviation(self) -> float:
@@ -326,6 +333,14 @@ def evidence_against(state: Any, dead_time: float) -> float:
     if slope > curvature > 0.0:
         least = costs[1] - 0.5 * slope**2 / curvature
     return float((cost_at(costs, dead_time) - least) / estimate.noise_ratio)
+
+
+@kernel
+def linear_evidence(state: Any, dead_time: float, other: float) -> float:
+    """Return 2 log of the likelihood ratio of another dead time and one, s, by the mean speed."""
+    accepted = state[0].accepted
+    apart = cost_at(accepted.linear, dead_time) - cost_at(accepted.linear, other)
+    return float(apart / state[0].noise_ratio)
 
 
 @kernel
@@ -448,6 +463,8 @@ def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
             cost += min(errors[i, g] ** 2 / variance, clip)
         in_window[g] += cost
         in_block[g] += cost
+        mean = 0.5 * (errors[0, g] + errors[1, g])
+        estimate.block.linear[g] += min(2.0 * mean**2 / variance, clip)
     for data in (estimate.window, estimate.block):
         data.duration += dt
         data.count += 2.0
@@ -575,6 +592,7 @@ def reject_block(estimate: Any, driving: bool) -> None:
     else:
         for g in range(GRID_SIZE):
             rejected.costs[g] += block.costs[g]
+            rejected.linear[g] += block.linear[g]
     other, least, _ = minimum(rejected.costs)
     returns = abs(other - estimate.configured) < RETURN_DIFFERENCE
     if rejected.duration < (RETURN_TIME if returns else CHANGE_TIME):
@@ -595,9 +613,9 @@ def reject_block(estimate: Any, driving: bool) -> None:
 @kernel
 def scale(data: Any, factor: float) -> None:
     """Weight all sums by a factor."""
-    costs = data.costs
     for g in range(GRID_SIZE):
-        costs[g] *= factor
+        data.costs[g] *= factor
+        data.linear[g] *= factor
     data.duration *= factor
     data.count *= factor
     data.information *= factor
@@ -609,6 +627,7 @@ def add(data: Any, other: Any) -> None:
     """Add the sums over other data."""
     for g in range(GRID_SIZE):
         data.costs[g] += other.costs[g]
+        data.linear[g] += other.linear[g]
     data.duration += other.duration
     data.count += other.count
     data.information += other.information
@@ -619,7 +638,7 @@ def add(data: Any, other: Any) -> None:
 def clear(data: Any) -> None:
     """Set all sums to zero, even those that are not finite."""
     for g in range(GRID_SIZE):
-        data.costs[g] = 0.0
+        data.costs[g] = data.linear[g] = 0.0
     data.duration = data.count = data.information = data.nis = 0.0
 
 
