@@ -31,7 +31,7 @@ from support.emulator_bench import MS, RobotBench, cable_bench
 from bench.page_table import PageTable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.robot_messages import state_warnings
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
 
 PHASES = 20

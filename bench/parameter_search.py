@@ -41,7 +41,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from t3mpc_ros.control.controller import StepperControllerParameters
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward
 from t3mpc_ros.evaluation.cases import CASES, cases_for
 from t3mpc_ros.evaluation.experiment import WorkerPool

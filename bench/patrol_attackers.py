@@ -39,7 +39,7 @@ import numpy as np
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
-from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.switching_signal import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, free_cells

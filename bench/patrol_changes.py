@@ -40,7 +40,6 @@ import yaml
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, print_report, run_experiment
-from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol.localization_study import localization_errors
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     START,
@@ -48,6 +47,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     run_patrol,
 )
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.radio.link.actions_and_states import LinkState, Open, Wait, Write
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState, Open, Wait, Write
 from t3mpc_ros.radio.protocol import codec, frames
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
-from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.switching_signal import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.geometry.polygon_arena import Arena
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter

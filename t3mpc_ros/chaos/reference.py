@@ -25,7 +25,7 @@ from typing import ClassVar
 import numpy as np
 
 from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.switching_signal import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.chaos.system_equations import hyperchaotic_system
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import Array, BodyTwist, WheelSpeeds

@@ -378,10 +378,10 @@ class Nt3fsMpcController:
     """Computes the wheel accelerations with which two wheels track a reference.
 
     The plant is (64)-(65): chi' = g*(chi) + u + omega for each wheel, with unknown g*.
-    :class:`~t3mpc_ros.control.velocity_command.VelocityActuation` provides this plant on a robot,
-    and reports by :meth:`set_applied` the u within the limits, because the estimates must use the
-    acceleration that was applied. Inputs are speeds, outputs accelerations; the law uses no pose
-    and no clock.
+    :class:`~t3mpc_ros.control.velocity_actuation.VelocityActuation` provides this plant on a
+    robot, and reports by :meth:`set_applied` the u within the limits, because the estimates must
+    use the acceleration that was applied. Inputs are speeds, outputs accelerations; the law uses
+    no pose and no clock.
 
     **Integral transfer.** The adaptation and the offset-free predictive term both integrate.
     Without further measures their shares of a persistent disturbance are arbitrary and may oppose

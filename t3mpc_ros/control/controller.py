@@ -41,7 +41,7 @@ from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.odometry_repair import OdometryTwist, StampFilter
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
-from t3mpc_ros.control.velocity_command import (
+from t3mpc_ros.control.velocity_actuation import (
     LimitParameters,
     ReachMonitor,
     VelocityActuation,

@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForward
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.loop import Method, MethodSpec, run
-from t3mpc_ros.evaluation.own_code import ModuleCarrier
+from t3mpc_ros.evaluation.modules_on_cluster import ModuleCarrier
 from t3mpc_ros.evaluation.result_output import progress_bar
 from t3mpc_ros.evaluation.run_record import Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario

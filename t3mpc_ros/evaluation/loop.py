@@ -18,7 +18,7 @@ once, carries that stamp back, and the robot follows it when it has arrived. Rep
 or lost on their way; what happens to a command on its way is a matter of the robot.
 
 A method is plain data that makes a driver for each run. One that answers accelerations sits
-between the state estimate and the limits of :mod:`t3mpc_ros.control.velocity_command`, which are
+between the state estimate and the limits of :mod:`t3mpc_ros.control.velocity_actuation`, which are
 the same for all methods; the controller of the node has its own.
 """
 
@@ -34,7 +34,7 @@ import numpy as np
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.velocity_command import VelocityActuation
+from t3mpc_ros.control.velocity_actuation import VelocityActuation
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, LinkFaults, cases_for
 from t3mpc_ros.evaluation.run_record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_of

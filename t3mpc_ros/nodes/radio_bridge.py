@@ -39,7 +39,7 @@ from t3mpc_ros.nodes.robot_messages import (
 )
 from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.parameters.table import group, parameter
-from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
+from t3mpc_ros.radio.link.actions_and_states import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.link.standstill_reasons import ROBOT_USB
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkQuality
 from t3mpc_ros.radio.link.telemetry import MICROSTEPS, STEPS_PER_REV

@@ -24,9 +24,9 @@ import numpy as np
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, State, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.radio.link.actions_and_states import LinkState, PortAction
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
 from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN, ROBOT_SILENT, restarted
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry

@@ -22,7 +22,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.switching import SwitchingSchedule
+from t3mpc_ros.chaos.switching_signal import SwitchingSchedule
 from t3mpc_ros.chaos.system_equations import hyperchaotic_system
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.parameters.table import ParameterError

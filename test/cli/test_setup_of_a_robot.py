@@ -36,7 +36,7 @@ import yaml
 from t3mpc_ros.cli import robot as cli
 from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool import procedure

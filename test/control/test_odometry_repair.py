@@ -515,7 +515,7 @@ def test_a_pose_that_is_late_or_rough_replaces_no_twist(seen, seed):
 
 @pytest.mark.parametrize('factors', [(1.1, 1.1), (1.2, 1.0)])
 @pytest.mark.parametrize('seed', range(3))
-def test_a_twist_too_large_of_a_robot_that_sets_off_makes_no_pose_late(factors, seed):
+def test_a_twist_too_large_at_the_start_makes_no_pose_late(factors, seed):
     """It is what the pose says a little later; the text named the pose in the first seconds."""
     texts = set()
     contradicted(

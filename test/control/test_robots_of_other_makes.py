@@ -36,7 +36,7 @@ from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.jump_transition import CommandLimit
 from t3mpc_ros.control.odometry_monitor import OdometryMonitor
-from t3mpc_ros.control.velocity_command import (
+from t3mpc_ros.control.velocity_actuation import (
     LEAST_SHORTFALL,
     LimitParameters,
     ReachMonitor,

@@ -17,8 +17,8 @@ import pytest
 from support.emulator_bench import MS, cable_bench
 
 from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol import codec, frames
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 

@@ -22,8 +22,8 @@ from support.long_tests import few_of
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.nrf24_radio import Medium, RadioParameters, Transmission
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 
 KEYS = bytes(range(16)), bytes(range(16, 32))
 

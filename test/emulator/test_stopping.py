@@ -22,7 +22,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.emulator.emulator import StopTimeMonitor
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 
 SPEED = 10.0  # both wheels at their maximum, rad/s
 REST = 0.45  # maximum time to rest, s

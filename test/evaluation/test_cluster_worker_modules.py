@@ -18,9 +18,10 @@ import sys
 
 import pytest
 
-from t3mpc_ros.evaluation import own_code
+from t3mpc_ros.evaluation import modules_on_cluster
 from t3mpc_ros.evaluation.api.script_inputs import FileController
-from t3mpc_ros.evaluation.own_code import SourceText, own_sources, run_carried, source_digest
+from t3mpc_ros.evaluation.modules_on_cluster import SourceText, own_sources, run_carried
+from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.script_error import ScriptError
 
 NAMES = ('carried', 'carried.law', 'carried_helper')
@@ -29,8 +30,8 @@ NAMES = ('carried', 'carried.law', 'carried_helper')
 @pytest.fixture
 def finder(monkeypatch):
     """A process that knows none of the modules, as a worker of another machine."""
-    found = own_code._Finder()
-    monkeypatch.setattr(own_code, 'FINDER', found)
+    found = modules_on_cluster._Finder()
+    monkeypatch.setattr(modules_on_cluster, 'FINDER', found)
     monkeypatch.setattr(sys, 'meta_path', [*sys.meta_path])
     yield found
     for name in NAMES:

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from support.records import record_of
 
-from t3mpc_ros.control.velocity_command import VelocityActuation
+from t3mpc_ros.control.velocity_actuation import VelocityActuation
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import CASES, NO_FAULTS, PLANTS

@@ -23,7 +23,7 @@ from support.records import record_of
 from bench.path_samplings import FeedbackLinearisation, LinearisationParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import path_tracker_comparison
 from t3mpc_ros.evaluation.patrol.path_tracker_comparison import (

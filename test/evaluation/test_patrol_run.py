@@ -18,7 +18,7 @@ import pytest
 
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.run_record import RATE
 

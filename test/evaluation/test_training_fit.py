@@ -26,7 +26,7 @@ from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
-from t3mpc_ros.control.velocity_command import LimitParameters, VelocityActuation
+from t3mpc_ros.control.velocity_actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models

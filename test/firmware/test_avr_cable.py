@@ -19,7 +19,7 @@ from support.avr_boards import ROBOT
 from support.emulator_bench import Bench, CablePort
 from support.missing_tools import AVR, needing
 
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 
 pytestmark = [needing(*AVR), pytest.mark.slow]
 

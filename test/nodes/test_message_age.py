@@ -40,7 +40,7 @@ from t3mpc_ros.nodes.base_node import ERROR
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
-from t3mpc_ros.radio.link.port_actions import Write
+from t3mpc_ros.radio.link.actions_and_states import Write
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed]
 

@@ -40,7 +40,7 @@ from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.registry import NODES, node_class, parameter_class
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import BatteryReading

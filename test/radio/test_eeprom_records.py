@@ -22,7 +22,7 @@ import random
 import pytest
 from support.firmware_core import Robot, load_core
 
-from t3mpc_ros.radio.link.port_actions import Write
+from t3mpc_ros.radio.link.actions_and_states import Write
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
 from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal

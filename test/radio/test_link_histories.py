@@ -25,8 +25,8 @@ from support.radio_bench import LinkBench
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.link_parameters import TTL_UNIT_NS, LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import CommandFlag

@@ -23,9 +23,9 @@ from support.radio_bench import MS, FakeRobot, LinkBench
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder

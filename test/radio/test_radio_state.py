@@ -25,7 +25,7 @@ from support.other_parameters import with_other_value
 from support.properties import PROPERTY
 from support.radio_bench import FakeRobot, LinkBench
 
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters

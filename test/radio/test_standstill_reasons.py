@@ -25,7 +25,7 @@ from support.radio_bench import FakeRobot, LinkBench
 
 from t3mpc_ros.nodes import robot_messages
 from t3mpc_ros.radio.link import standstill_reasons as reasons
-from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag

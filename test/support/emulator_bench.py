@@ -18,9 +18,9 @@ import random
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.radio.link.actions_and_states import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle
 from t3mpc_ros.radio.protocol.frames import Command, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder

@@ -16,8 +16,8 @@
 import random
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
+from t3mpc_ros.radio.link.actions_and_states import Close, Open, Wait, Write
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, Open, Wait, Write
 from t3mpc_ros.radio.tool import manoeuvre
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Procedure, ProcedureError
 

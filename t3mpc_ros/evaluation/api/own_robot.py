@@ -22,7 +22,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation.api.one_sentence_errors import described, one_sentence
 from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only

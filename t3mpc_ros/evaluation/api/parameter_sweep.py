@@ -43,8 +43,8 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table, columns_of
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.parameters.version_and_commit import provenance

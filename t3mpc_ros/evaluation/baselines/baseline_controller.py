@@ -14,7 +14,7 @@
 """Interface of the compared controllers: nominal model, observation, step.
 
 All methods share the state estimate, the actuation and its limits
-(:mod:`t3mpc_ros.control.velocity_command`); they differ in how they choose an acceleration. The
+(:mod:`t3mpc_ros.control.velocity_actuation`); they differ in how they choose an acceleration. The
 plant that a method controls is one equation for either drive, exact at the control periods T,
 
     chi_(k+1) = chi_k + T (u_k + d_k).

@@ -24,10 +24,10 @@ from t3mpc_ros.evaluation import fuzzy_estimation_error, html_page, result_outpu
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.figure_style import write_pictures
 from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
-from t3mpc_ros.evaluation.own_code import source_digest
 from t3mpc_ros.evaluation.paper import paper_figures, paper_study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_study import Results, all_tables, csv_columns
+from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.parameters.version_and_commit import machine, provenance
 from t3mpc_ros.version import VERSION
 

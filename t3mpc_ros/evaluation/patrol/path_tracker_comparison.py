@@ -29,11 +29,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.control.velocity_command import LimitParameters
+from t3mpc_ros.control.velocity_actuation import LimitParameters
 from t3mpc_ros.evaluation import html_page, result_output
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean, rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
-from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.pure_pursuit import (
@@ -41,6 +40,7 @@ from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     Pursuit,
     RegulatedParameters,
 )
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path

@@ -42,7 +42,6 @@ from t3mpc_ros.evaluation.confidence_intervals import (
     paired,
 )
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
-from t3mpc_ros.evaluation.own_code import digest
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
@@ -54,6 +53,7 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     visits,
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

@@ -29,7 +29,7 @@ from typing import Protocol
 
 import numpy as np
 
-from t3mpc_ros.control.velocity_command import LimitParameters, limit_command, wheel_limits
+from t3mpc_ros.control.velocity_actuation import LimitParameters, limit_command, wheel_limits
 from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.polyline import check_points, polyline_length, resample

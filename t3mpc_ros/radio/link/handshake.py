@@ -22,8 +22,8 @@ from collections.abc import Callable
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.transaction import TransactionResult
 from t3mpc_ros.radio.protocol import authentication, frames
 

@@ -23,9 +23,9 @@ import secrets
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.actions_and_states import Close, LinkState, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.link.handshake import BOOTS_ID, Entropy, Handshake, Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
 from t3mpc_ros.radio.link.statistics import LinkQuality, LinkStatistics, Loss
 from t3mpc_ros.radio.link.telemetry import GYRO_RANGE, Telemetry, TelemetryDecoder

@@ -26,9 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
+from t3mpc_ros.radio.link.actions_and_states import LinkState, PortAction, Wait
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState, PortAction, Wait
 from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot.calibration import Recording
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, WheelAngles

@@ -26,7 +26,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link import standstill_reasons as reasons
-from t3mpc_ros.radio.link.port_actions import Close, Open, PortAction, Wait, Write
+from t3mpc_ros.radio.link.actions_and_states import Close, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame

@@ -23,7 +23,7 @@ import pytest
 from scipy.stats import kstest
 from support.properties import PROPERTY
 
-from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.switching_signal import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.parameters.table import ParameterError
 
 RANDOM = SwitchingParameters(kind='random', shortest_dwell=2.0, longest_dwell=5.0)

@@ -23,7 +23,7 @@ from t3mpc_ros.control.speed_kalman_filter import (
     SpeedKalmanFilter,
     stationary_gain,
 )
-from t3mpc_ros.control.velocity_command import (
+from t3mpc_ros.control.velocity_actuation import (
     LimitParameters,
     VelocityActuation,
     limit_command,
