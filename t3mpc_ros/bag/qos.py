@@ -30,7 +30,7 @@ import yaml
 
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.parameters.user_yaml import PlainDumper, file_errors, read_yaml, shortened
+from t3mpc_ros.parameters.yaml_loader import PlainDumper, file_errors, read_yaml, shortened
 
 UNLIMITED = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""

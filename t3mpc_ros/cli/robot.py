@@ -35,7 +35,7 @@ from t3mpc_ros.cli.shared_options import (
 from t3mpc_ros.evaluation.api.one_sentence_errors import sentence
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.user_yaml import file_errors, read_yaml
+from t3mpc_ros.parameters.yaml_loader import file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key

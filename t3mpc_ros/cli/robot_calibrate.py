@@ -27,7 +27,7 @@ from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.user_yaml import file_errors, parameter_file, read_yaml
+from t3mpc_ros.parameters.yaml_loader import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,

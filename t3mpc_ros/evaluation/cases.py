@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import math
 from pathlib import Path
 
-from t3mpc_ros.parameters.user_yaml import EntryError, check_list, check_number
+from t3mpc_ros.parameters.yaml_loader import EntryError, check_list, check_number
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
 

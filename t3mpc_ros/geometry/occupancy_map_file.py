@@ -20,7 +20,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters import user_yaml
+from t3mpc_ros.parameters import yaml_loader
 
 MAX_CELLS = 25_000_000
 """Largest number of cells of a grid."""
@@ -72,20 +72,20 @@ def load_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     """
     file = Path(path)
     names = 'image', 'resolution', 'origin', 'negate', 'occupied_thresh', 'free_thresh'
-    with user_yaml.file_errors(file, MapError):
-        read = user_yaml.check_entry(user_yaml.read_yaml(file), 'the map', names, ('mode',))
+    with yaml_loader.file_errors(file, MapError):
+        read = yaml_loader.check_entry(yaml_loader.read_yaml(file), 'the map', names, ('mode',))
         if read.get('mode', 'trinary') not in ('trinary', 'scale'):
-            raise user_yaml.EntryError(f'mode must be trinary or scale: got {read["mode"]}')
-        resolution = user_yaml.check_number(read['resolution'], 'resolution', 1e-3, 10.0, 'm')
+            raise yaml_loader.EntryError(f'mode must be trinary or scale: got {read["mode"]}')
+        resolution = yaml_loader.check_number(read['resolution'], 'resolution', 1e-3, 10.0, 'm')
         x, y, yaw = (
-            user_yaml.check_number(number, f'origin[{index}]', -1e4, 1e4)
-            for index, number in enumerate(user_yaml.check_list(read['origin'], 'origin', 3, 3))
+            yaml_loader.check_number(number, f'origin[{index}]', -1e4, 1e4)
+            for index, number in enumerate(yaml_loader.check_list(read['origin'], 'origin', 3, 3))
         )
-        occupied = user_yaml.check_number(read['occupied_thresh'], 'occupied_thresh', 0.0, 1.0)
-        free = user_yaml.check_number(read['free_thresh'], 'free_thresh', 0.0, occupied)
-        negate = user_yaml.check_number(read['negate'], 'negate', 0, 1) != 0
+        occupied = yaml_loader.check_number(read['occupied_thresh'], 'occupied_thresh', 0.0, 1.0)
+        free = yaml_loader.check_number(read['free_thresh'], 'free_thresh', 0.0, occupied)
+        negate = yaml_loader.check_number(read['negate'], 'negate', 0, 1) != 0
         if not isinstance(read['image'], str):
-            raise user_yaml.EntryError('image must be the name of a file')
+            raise yaml_loader.EntryError('image must be the name of a file')
     image = file.parent / read['image']
     share = _read_pgm(image)[::-1]
     darkness = share if negate else 1.0 - share

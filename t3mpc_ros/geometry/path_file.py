@@ -21,7 +21,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.polyline import MAX_COORDINATE, PathError
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters import user_yaml
+from t3mpc_ros.parameters import yaml_loader
 
 MAX_FILE_SIZE = 20_000_000
 """Bytes."""
@@ -39,11 +39,11 @@ def load_path(file: str | Path) -> Array:
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise PathError(f'{path} must end in .csv or .yaml: got {path.suffix or "no suffix"!r}')
-    with user_yaml.file_errors(path, PathError):
-        rows = readers[suffix](user_yaml.read_text(path, MAX_FILE_SIZE))
+    with yaml_loader.file_errors(path, PathError):
+        rows = readers[suffix](yaml_loader.read_text(path, MAX_FILE_SIZE))
         points = np.array([_point(where, row) for where, row in rows]).reshape(-1, 2)
         if len(points) < 2 or not np.ptp(points, axis=0).any():
-            raise user_yaml.EntryError(f'two points that differ are needed: got {len(points)}')
+            raise yaml_loader.EntryError(f'two points that differ are needed: got {len(points)}')
     return points
 
 
@@ -53,22 +53,22 @@ def _csv_rows(text: str) -> list[tuple[str, object]]:
     if rows and not _is_number(rows[0][0]):
         header = [name.strip().lower() for name in rows.pop(0)]
         if 'x' not in header or 'y' not in header:
-            raise user_yaml.EntryError(f'the header must have x and y: got {", ".join(header)}')
+            raise yaml_loader.EntryError(f'the header must have x and y: got {", ".join(header)}')
         columns = header.index('x'), header.index('y')
     found: list[tuple[str, object]] = []
     for number, row in enumerate(rows):
         if len(row) <= max(columns):
-            raise user_yaml.EntryError(f'point {number} must have x and y: got {row}')
+            raise yaml_loader.EntryError(f'point {number} must have x and y: got {row}')
         found.append((f'point {number}', [row[column] for column in columns]))
     return found
 
 
 def _yaml_rows(text: str) -> list[tuple[str, object]]:
-    content = user_yaml.check_entry(
-        user_yaml.parse_yaml(text), 'the path', ('points',), ('closed', 'name')
+    content = yaml_loader.check_entry(
+        yaml_loader.parse_yaml(text), 'the path', ('points',), ('closed', 'name')
     )
-    points = user_yaml.check_list(content['points'], 'points')
-    closed = user_yaml.check_flag(content.get('closed', False), 'closed')
+    points = yaml_loader.check_list(content['points'], 'points')
+    closed = yaml_loader.check_flag(content.get('closed', False), 'closed')
     return [(f'points[{n}]', point) for n, point in enumerate(points + points[:1] * closed)]
 
 
@@ -82,7 +82,9 @@ def _is_number(text: str) -> bool:
 
 def _point(where: str, row: object) -> tuple[float, float]:
     if not isinstance(row, list) or len(row) != 2:
-        raise user_yaml.EntryError(f'{where} must be [x, y] in m: got {user_yaml.shortened(row)}')
+        raise yaml_loader.EntryError(
+            f'{where} must be [x, y] in m: got {yaml_loader.shortened(row)}'
+        )
     found = []
     for name, value in zip('xy', row, strict=True):
         try:
@@ -90,9 +92,9 @@ def _point(where: str, row: object) -> tuple[float, float]:
         except (TypeError, ValueError):
             number = math.nan
         if not abs(number) <= MAX_COORDINATE:
-            raise user_yaml.EntryError(
+            raise yaml_loader.EntryError(
                 f'{name} of {where} must be a number of at most {MAX_COORDINATE:g} m: '
-                f'got {user_yaml.shortened(value)}'
+                f'got {yaml_loader.shortened(value)}'
             )
         found.append(number)
     return found[0], found[1]

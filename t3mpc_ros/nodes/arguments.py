@@ -85,7 +85,7 @@ def _wrapped(head: str, text: str) -> list[str]:
 
 def parameter_file_problem(argv: Sequence[str]) -> str:
     """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
-    from t3mpc_ros.parameters.user_yaml import YamlError, read_yaml
+    from t3mpc_ros.parameters.yaml_loader import YamlError, read_yaml
 
     for name in _parameter_files(argv):
         try:
@@ -168,7 +168,7 @@ def file_values(file: str, node: str) -> dict[str, object]:
 
 def _entries(file: str) -> Iterator[tuple[str, str, object]]:
     """Yield node, parameter and value; namespaces may be nested keys, as groups are."""
-    from t3mpc_ros.parameters.user_yaml import read_yaml  # a missing library has a remedy
+    from t3mpc_ros.parameters.yaml_loader import read_yaml  # a missing library has a remedy
 
     def leaves(tree: object, path: tuple[str, ...]) -> Iterator[tuple[str, str, object]]:
         if isinstance(tree, dict) and tree:

@@ -55,7 +55,11 @@ from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.node_main import own_context
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
-from t3mpc_ros.nodes.topic_endpoints import PolledCallbackGroup, full_name, take_with_info
+from t3mpc_ros.nodes.topic_endpoints import (
+    PolledCallbackGroup,
+    full_name,
+    take_with_info,
+)
 from t3mpc_ros.robot.sensor_mounts import sensor_mounts
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline

@@ -21,7 +21,7 @@ import math
 import os
 from pathlib import Path
 
-from t3mpc_ros.parameters import user_yaml
+from t3mpc_ros.parameters import yaml_loader
 from t3mpc_ros.parameters.table import (
     ParameterError,
     Value,
@@ -64,19 +64,19 @@ class FaultEvent:
     def __post_init__(self) -> None:
         try:
             object.__setattr__(
-                self, 'at', user_yaml.check_number(self.at, 'at', 0.0, _MAX_TIME, 's')
+                self, 'at', yaml_loader.check_number(self.at, 'at', 0.0, _MAX_TIME, 's')
             )
             if self.duration != math.inf:
-                duration = user_yaml.check_number(
+                duration = yaml_loader.check_number(
                     self.duration, 'for', MIN_DURATION, _MAX_TIME, 's'
                 )
                 object.__setattr__(self, 'duration', duration)
-        except user_yaml.EntryError as error:
+        except yaml_loader.EntryError as error:
             raise ScheduleError(str(error)) from None
         if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(FAULTS)}: '
-                f'got {user_yaml.shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
+                f'got {yaml_loader.shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
         try:
             object.__setattr__(self, 'value', FAULTS[self.fault].check(self.value))
@@ -169,19 +169,19 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
                 f'got {name}{nearest_hint(str(name), bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
-    with user_yaml.file_errors(name, ScheduleError):
-        content = user_yaml.read_yaml(path)
+    with yaml_loader.file_errors(name, ScheduleError):
+        content = yaml_loader.read_yaml(path)
         if isinstance(content, dict):
-            content = user_yaml.check_entry(content, 'the schedule', ('events',))['events']
+            content = yaml_loader.check_entry(content, 'the schedule', ('events',))['events']
         return FaultSchedule(
-            map(_event, count(), user_yaml.check_list(content, 'events')), path.stem
+            map(_event, count(), yaml_loader.check_list(content, 'events')), path.stem
         )
 
 
 def _event(index: int, content: object) -> FaultEvent:
     where = f'events[{index}]'
-    entry = user_yaml.check_entry(content, where, ('at', 'fault', 'value'), ('for',))
+    entry = yaml_loader.check_entry(content, where, ('at', 'fault', 'value'), ('for',))
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
-        raise user_yaml.EntryError(f'{where}.{error}') from None
+        raise yaml_loader.EntryError(f'{where}.{error}') from None

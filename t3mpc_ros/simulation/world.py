@@ -32,7 +32,7 @@ from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.polyline import lengths_along
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters import user_yaml
+from t3mpc_ros.parameters import yaml_loader
 from t3mpc_ros.parameters.table import nearest_hint
 
 WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
@@ -220,8 +220,8 @@ def load_world(path_or_name: str | Path) -> World:
     if path_or_name in names:
         path = WORLDS_FOLDER / f'{path_or_name}.yaml'
     try:
-        text = user_yaml.read_text(path)
-    except user_yaml.YamlError as error:
+        text = yaml_loader.read_text(path)
+    except yaml_loader.YamlError as error:
         if not isinstance(error.__cause__, FileNotFoundError):
             raise WorldError(f'{path} {error}') from error
         raise WorldError(
@@ -236,16 +236,16 @@ def parse_world(text: str, source: str) -> World:
 
     Errors begin with ``source``; without ``name`` in the text, its stem is that of the world.
     """
-    with user_yaml.file_errors(source, WorldError):
-        return _world(user_yaml.parse_yaml(text), Path(source).stem)
+    with yaml_loader.file_errors(source, WorldError):
+        return _world(yaml_loader.parse_yaml(text), Path(source).stem)
 
 
 def _world(content: object, stem: str) -> World:
     lists = ('walls', 'boxes', 'circles', 'patches', 'moving', 'chargers')
-    read = user_yaml.check_entry(content, 'the world', (), ('name', *lists))
+    read = yaml_loader.check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
-        raise user_yaml.EntryError(f'name must be a text: got {user_yaml.shortened(name)}')
+        raise yaml_loader.EntryError(f'name must be a text: got {yaml_loader.shortened(name)}')
     pieces: dict[bool, list[tuple[float, ...]]] = {False: [], True: []}
     """Walls by whether they are unseen."""
     boxes = []
@@ -290,7 +290,7 @@ def _floor(
     rows = [
         (
             *_disc(where, each),
-            user_yaml.check_number(each[key], f'{where}.{key}', 0.0, most, unit),
+            yaml_loader.check_number(each[key], f'{where}.{key}', 0.0, most, unit),
         )
         for where, each in _entries(read, name, count, ('center', 'radius', key))
     ]
@@ -298,15 +298,15 @@ def _floor(
 
 
 def _flag(read: dict[str, Any], where: str, key: str) -> bool:
-    return user_yaml.check_flag(read.get(key, False), f'{where}.{key}')
+    return yaml_loader.check_flag(read.get(key, False), f'{where}.{key}')
 
 
 def _moving(where: str, read: dict[str, Any]) -> MovingDisc:
     def number(key: str, low: float, high: float, unit: str, default: float = 0.0) -> float:
         value = read.get(key, default)
-        return user_yaml.check_number(value, f'{where}.{key}', low, high, unit)
+        return yaml_loader.check_number(value, f'{where}.{key}', low, high, unit)
 
-    given = user_yaml.check_list(read['points'], f'{where}.points', 1, MAX_SEGMENTS)
+    given = yaml_loader.check_list(read['points'], f'{where}.points', 1, MAX_SEGMENTS)
     points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
     return MovingDisc(
         number('radius', MIN_SIZE, MAX_COORDINATE, 'm'),
@@ -330,7 +330,7 @@ def _without(rows: Array, others: Array) -> Array:
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
     closed = _flag(read, where, 'closed')
-    given = user_yaml.check_list(
+    given = yaml_loader.check_list(
         read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1
     )
     points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
@@ -338,7 +338,7 @@ def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
         length = math.dist(points[index - 1], points[index])
         if length < MIN_SIZE:
             last = '; leave the last point out, closed adds it' if index == 0 else ''
-            raise user_yaml.EntryError(
+            raise yaml_loader.EntryError(
                 f'{where}.points[{index}] must be at least {MIN_SIZE:g} m from the point before '
                 f'it: got {length:g} m{last}'
             )
@@ -347,13 +347,15 @@ def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
 
 def _box(read: dict[str, Any], where: str) -> tuple[float, float, float, float, float]:
     # More than a full turn is a yaw in degrees.
-    yaw = user_yaml.check_number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad')
+    yaw = yaml_loader.check_number(
+        read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad'
+    )
     size = _pair(read['size'], f'{where}.size', MIN_SIZE)
     return *_pair(read['center'], f'{where}.center'), *size, yaw
 
 
 def _disc(where: str, read: dict[str, Any]) -> tuple[float, float, float]:
-    radius = user_yaml.check_number(
+    radius = yaml_loader.check_number(
         read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, 'm'
     )
     return *_pair(read['center'], f'{where}.center'), radius
@@ -375,22 +377,22 @@ def _sides(
 def _entries(
     read: dict[str, Any], name: str, most: int, needed: tuple[str, ...], *optional: str
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    for index, content in enumerate(user_yaml.check_list(read.get(name, []), name, 0, most)):
+    for index, content in enumerate(yaml_loader.check_list(read.get(name, []), name, 0, most)):
         where = f'{name}[{index}]'
-        yield where, user_yaml.check_entry(content, where, needed, optional)
+        yield where, yaml_loader.check_entry(content, where, needed, optional)
 
 
 def _pair(content: object, where: str, low: float = -MAX_COORDINATE) -> tuple[float, float]:
-    x, y = user_yaml.check_list(content, where, 2, 2)
+    x, y = yaml_loader.check_list(content, where, 2, 2)
     return (
-        user_yaml.check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
-        user_yaml.check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
+        yaml_loader.check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
+        yaml_loader.check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
     )
 
 
 def _check_count(count: int) -> None:
     if count > MAX_SEGMENTS:
-        raise user_yaml.EntryError(
+        raise yaml_loader.EntryError(
             f'walls and boxes must have at most {MAX_SEGMENTS} segments together: '
             f'got {count} or more'
         )

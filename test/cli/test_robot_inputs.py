@@ -20,7 +20,7 @@ from support.long_tests import few_of
 import yaml
 
 from t3mpc_ros.cli import robot as cli
-from t3mpc_ros.parameters.user_yaml import YamlError
+from t3mpc_ros.parameters.yaml_loader import YamlError
 from t3mpc_ros.radio.tool.robot_settings import (
     RobotSettings,
     parse_address,

@@ -23,7 +23,7 @@ from support.long_tests import few_of
 from support.tool_bench import START_NS, ToolBench
 import yaml
 
-from t3mpc_ros.parameters.user_yaml import YamlError
+from t3mpc_ros.parameters.yaml_loader import YamlError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key

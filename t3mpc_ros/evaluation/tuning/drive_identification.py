@@ -41,7 +41,7 @@ from t3mpc_ros.evaluation.drive_response import (
 from t3mpc_ros.evaluation.topic_roles import COMMAND, KINDS, ODOMETRY, ReportOptions
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters.user_yaml import parameter_file
+from t3mpc_ros.parameters.yaml_loader import parameter_file
 from t3mpc_ros.robot.calibration import Estimate
 
 MIN_DURATION = 10.0

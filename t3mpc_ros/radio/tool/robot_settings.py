@@ -19,7 +19,7 @@ import struct
 from typing import Any, NamedTuple
 
 from t3mpc_ros.parameters.table import number_hint
-from t3mpc_ros.parameters.user_yaml import YamlError, parameter_file, shortened
+from t3mpc_ros.parameters.yaml_loader import YamlError, parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.radio.tool.eeprom_records import (

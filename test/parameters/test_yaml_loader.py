@@ -15,7 +15,7 @@
 
 import pytest
 
-from t3mpc_ros.parameters.user_yaml import (
+from t3mpc_ros.parameters.yaml_loader import (
     MAX_FILE_SIZE,
     YamlError,
     parse_yaml,
