@@ -47,7 +47,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     run_patrol,
 )
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change

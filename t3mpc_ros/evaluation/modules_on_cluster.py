@@ -28,7 +28,7 @@ from threading import RLock
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from t3mpc_ros.evaluation.run_digest import is_own, own_text, source_digest
+from t3mpc_ros.evaluation.run_cache_key import is_own, own_text, source_digest
 from t3mpc_ros.script_error import ScriptError
 
 

@@ -21,7 +21,7 @@ import pytest
 from t3mpc_ros.evaluation import modules_on_cluster
 from t3mpc_ros.evaluation.api.script_inputs import FileController
 from t3mpc_ros.evaluation.modules_on_cluster import SourceText, own_sources, run_carried
-from t3mpc_ros.evaluation.run_digest import source_digest
+from t3mpc_ros.evaluation.run_cache_key import source_digest
 from t3mpc_ros.script_error import ScriptError
 
 NAMES = ('carried', 'carried.law', 'carried_helper')

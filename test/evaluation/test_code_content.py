@@ -19,7 +19,7 @@ import sys
 import numpy as np
 import pytest
 
-from t3mpc_ros.evaluation.run_digest import code_content, content_of
+from t3mpc_ros.evaluation.run_cache_key import code_content, content_of
 
 HELPER = 'GAIN = {gain}\n\n\ndef gain():\n    return {value}\n'
 LAW = """

@@ -23,10 +23,10 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.evaluation import run_digest
+from t3mpc_ros.evaluation import run_cache_key
 from t3mpc_ros.evaluation.experiment import JobError, ResultFile, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.result_output import progress_bar
-from t3mpc_ros.evaluation.run_digest import content_of, digest, source_digest
+from t3mpc_ros.evaluation.run_cache_key import content_of, digest, source_digest
 
 ROWS = [
     {'controller': name, 'seed': seed, 'error': error}
@@ -250,5 +250,5 @@ def test_the_digest_covers_sources_that_change_a_run(tmp_path, monkeypatch):
         seen.add(sources(tmp_path))
     assert len(seen) == 1 + len(relevant)
     known = digest(1)
-    monkeypatch.setattr(run_digest, 'source_digest', lambda: 'other')
+    monkeypatch.setattr(run_cache_key, 'source_digest', lambda: 'other')
     assert digest(1) != known

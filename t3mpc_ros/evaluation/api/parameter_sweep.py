@@ -44,7 +44,7 @@ from t3mpc_ros.evaluation.experiment import (
     run_experiment,
 )
 from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table, columns_of
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.parameters.version_and_commit import provenance

@@ -26,7 +26,7 @@ from t3mpc_ros.evaluation.loop import MethodSpec
 from t3mpc_ros.evaluation.method_table import FULL, methods
 from t3mpc_ros.evaluation.method_table import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.result_output import EMPTY_CELL, Table, columns_of, finite
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import START, Record
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario, held_out
 

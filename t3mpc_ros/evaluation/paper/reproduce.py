@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.method_table import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper import paper_figures, paper_study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_study import Results, all_tables, csv_columns
-from t3mpc_ros.evaluation.run_digest import source_digest
+from t3mpc_ros.evaluation.run_cache_key import source_digest
 from t3mpc_ros.parameters.version_and_commit import machine, provenance
 from t3mpc_ros.version import VERSION
 

@@ -31,7 +31,7 @@ from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.result_output import Table
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import ON_PATH, RATE, Record, spans_of
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import find_names

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     Pursuit,
     RegulatedParameters,
 )
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import RATE, Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path

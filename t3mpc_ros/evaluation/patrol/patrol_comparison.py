@@ -53,7 +53,7 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     visits,
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_cache_key import digest
 from t3mpc_ros.evaluation.run_record import Record
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

@@ -26,7 +26,7 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation import run_digest
+from t3mpc_ros.evaluation import run_cache_key
 from t3mpc_ros.evaluation.api import parameter_sweep
 from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
 from t3mpc_ros.evaluation.cases import LinkFaults
@@ -277,8 +277,8 @@ def test_the_key_of_a_run_changes_with_its_place_in_the_sweep(monkeypatch):
     assert {*again} < {*found}
     # What the package is made of, and the Python that runs it.
     for module, name, other in (
-        (run_digest, 'source_digest', 'x'),
-        (run_digest, 'VERSION', '0'),
+        (run_cache_key, 'source_digest', 'x'),
+        (run_cache_key, 'VERSION', '0'),
         (parameter_sweep, 'provenance', {'python': '4'}),
     ):
         new = other if name == 'VERSION' else lambda value=other: value

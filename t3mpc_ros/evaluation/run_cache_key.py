@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Digest of a run: of all that determines its numbers, the user's own code among it.
+"""Key of a stored run: a digest of all that determines its numbers, the user's own code among it.
 
 Of functions and classes it has the source, and what of a user's own code they use. The name of a
 class of a notebook is not enough, nor is its source if it uses a constant above it or a module
