@@ -84,6 +84,14 @@ class TopicChoice:
 def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
     """Return the topic of each role."""
     names, namespaces = find_topics(recording.topics, wanted.namespace)
+    if wanted.namespace and not any(
+        topic.startswith(f'{namespaces[0]}/') for topic in recording.topics
+    ):
+        others = ', '.join(each or '/' for each in namespaces[1:]) or 'none with known topics'
+        raise ReportError(
+            f'{recording.folder}: no topic is in the namespace {namespaces[0]}; namespaces in the '
+            f'bag: {others}'
+        )
     filled = {name: topic for name, topic in recording.topics.items() if topic.message_count}
     chosen = {
         name: full

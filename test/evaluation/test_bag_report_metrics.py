@@ -69,6 +69,7 @@ from t3mpc_ros.evaluation.topic_roles import (
     REFERENCE,
     SCALARS,
     TRUTH,
+    ReportError,
     ReportOptions,
     find_topics,
 )
@@ -387,6 +388,8 @@ def test_another_namespace_is_named_and_can_be_chosen(tmp_path):
     assert 'The bag also holds topics of /fleet/robot2' in text
     with open_bag(tmp_path / 'bag') as recording:
         second = load_run(recording, ReportOptions(namespace='fleet/robot2'))
+        with pytest.raises(ReportError, match=r'namespace /r1; .*: /fleet/robot1, /fleet/robot2'):
+            load_run(recording, ReportOptions(namespace='r1'))
     assert len(tracking_error(second, TRUTH)) == 50
 
 

@@ -273,6 +273,10 @@ STORIES = {
         rf'2\d\.\d % of cmd_vel is missing or not finite; {SETTLED}\.', 'open', rate=100.0,
         kept=lambda t, topic: topic != '/cmd_vel' or round(997.0 * t) % 10 > 2,
     ),
+    'reference lost': Story(
+        rf'[3-5]\.\d % of reference is missing or not finite; {SETTLED}\.', 'open', rate=100.0,
+        kept=lambda t, topic: topic != '/reference' or round(997.0 * t) % 20 > 0,
+    ),
     'patrol': Story(
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
         r'\(RMS\); the rest were detours around obstacles and the ways back\.', 'good',

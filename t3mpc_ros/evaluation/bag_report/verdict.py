@@ -160,12 +160,13 @@ def judge(
     if missing > MAX_MISSING:
         text = f'{100.0 * missing:.1f} % of {ODOMETRY} is missing'
         loss.append(_Finding(text, 'Data missing', spoils=True))
-    elif (share := _missing_commands(run)) > MAX_MISSING:
-        loss.append(
-            _Finding(
-                f'{100.0 * share:.1f} % of {COMMAND} is missing or not finite', 'Data missing'
-            )
-        )
+    else:
+        shares = {COMMAND: _missing_commands(run), REFERENCE: _missing_reference(run)}
+        loss += [
+            _Finding(f'{100.0 * share:.1f} % of {name} is missing or not finite', 'Data missing')
+            for name, share in shares.items()
+            if share > MAX_MISSING
+        ]
     findings += [*_jumps(incidents), *_lost_parts(run), *slow, *loss]
     late = _late(run, latency_99)
     distance, on_path = path_distance(run), None
@@ -400,6 +401,12 @@ def _missing_commands(run: Run) -> float:
         return 0.0
     same = abs(command.period - odometry.period) < 0.2 * odometry.period
     return command.missing - odometry.missing if same else 0.0
+
+
+def _missing_reference(run: Run) -> float:
+    """Return the missing share of the reference of our generator, which comes regularly."""
+    reference = run.timing.get(REFERENCE)
+    return reference.missing if run.ours and reference is not None else 0.0
 
 
 def _lost_parts(run: Run) -> Iterator[_Finding]:
