@@ -93,6 +93,9 @@ FEEDBACK_RANGE = {'body': (0.8, 1.2), 'paper': (0.0, 1.4)}
 """Permitted slope of the command in the speed error, relative to the one that fits."""
 
 MIN_DEAD_TIME_CHANGE = 0.0005  # smallest change (s) of the dead time in use
+LINEAR_EVIDENCE = 2.0, 4.0
+"""Likelihood ratio, 2 log, of the mean speed alone from which the dead time is not changed against
+it: where the pose leaves open that the yaw rate is late, and where it does not."""
 
 NO_DEAD_TIME = 0.001
 """Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
@@ -941,11 +944,14 @@ class Controller:
         elif not self.disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
-        longer = dead_time - self._dead_time
-        if longer > MIN_DEAD_TIME_CHANGE and self.odometry_twist.may_be_late(longer):
+        longer, twist = dead_time - self._dead_time, self.odometry_twist
+        if longer > MIN_DEAD_TIME_CHANGE and twist.may_be_late(longer):
             return  # comparisons with the pose decide that first
         if abs(longer) > MIN_DEAD_TIME_CHANGE:
-            self._set_dead_time(dead_time)
+            against = self.dead_time.linear_evidence(dead_time, self._dead_time)
+            most = LINEAR_EVIDENCE[not twist.may_turn_late(longer)]
+            if against < most or not self.parameters.estimate_dead_time:
+                self._set_dead_time(dead_time)
 
     def _set_dead_time(self, dead_time: float) -> None:
         """Use a dead time (s); below 0 the robot responds before its lag has passed."""

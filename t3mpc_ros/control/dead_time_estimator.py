@@ -55,10 +55,9 @@ GRID_SIZE = 31
 PRIOR_DEVIATION = 0.03  # standard deviation of the configured dead time, s
 IDENTIFIED_DEVIATION = 0.005
 """Standard deviation at and below which the dead time is identified, s."""
-USED_DIFFERENCE, USED_EVIDENCE, LINEAR_EVIDENCE = 0.004, 7.0, 2.0
+USED_DIFFERENCE, USED_EVIDENCE = 0.004, 7.0
 """Difference (s), and likelihood ratio, 2 log, up to which the configured dead time is kept: so
-much the estimate is off if the drive responds otherwise than the lag describes; and the ratio, of
-the mean of both wheels alone, from which it is kept against them: only the yaw rate is late."""
+much the estimate is off if the drive responds otherwise than the lag describes."""
 MIN_DEVIATION = 0.0005
 """Standard deviation at which older data is forgotten as newer data is accepted, s."""
 UNCERTAINTY_FACTOR = 2.0
@@ -252,11 +251,8 @@ class DeadTimeEstimator:
         # Neither is enough: the costs of a few blocks, or at the end of the grid, are no parabola.
         if abs(dead_time - self._configured) <= least:
             return self._configured
-        configured = self._configured + self.lateness
-        clear = self.evidence_against(configured) > USED_EVIDENCE
-        if clear and self._linear(self._state, self.dead_time, configured) < LINEAR_EVIDENCE:
-            return dead_time
-        return self._configured
+        clear = self.evidence_against(self._configured + self.lateness) > USED_EVIDENCE
+        return dead_time if clear else self._configured
 
     @property
     def standard_deviation(self) -> float:
@@ -269,6 +265,13 @@ class DeadTimeEstimator:
         The best one may be below 0, where the parabola of the smallest dead times has its minimum.
         """
         return self._evidence(self._state, dead_time)
+
+    def linear_evidence(self, dead_time: float, other: float) -> float:
+        """Return 2 log of the likelihood ratio of another dead time and one, s, by the mean speed.
+
+        Where it contradicts what both wheels say, the yaw rate is late, or has another scale.
+        """
+        return self._linear(self._state, dead_time, other)
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
@@ -337,7 +340,7 @@ def evidence_against(state: Any, dead_time: float) -> float:
 
 @kernel
 def linear_evidence(state: Any, dead_time: float, other: float) -> float:
-    """Return 2 log of the likelihood ratio of another dead time and one, s, by the mean speed."""
+    """Do :meth:`DeadTimeEstimator.linear_evidence`; ``state`` as of :func:`update_dead_time`."""
     accepted = state[0].accepted
     apart = cost_at(accepted.linear, dead_time) - cost_at(accepted.linear, other)
     return float(apart / state[0].noise_ratio)

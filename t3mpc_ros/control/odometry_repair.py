@@ -531,6 +531,10 @@ class TwistFit:
         both = [fit.evidence_of_lag(time) for fit in self._fits]
         return sum(both) > LAG_EVIDENCE or max(both) > ONE_EVIDENCE
 
+    def may_turn_late(self, time: float) -> bool:
+        """Whether the comparisons leave it open that the yaw rate is late by ``time``, s."""
+        return self._fits[1].evidence_of_lag(time) > -ONE_EVIDENCE
+
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
         linear, angular = self._fits
@@ -771,6 +775,10 @@ class OdometryTwist:
     def may_be_late(self, time: float) -> bool:
         """Whether a twist that is used is more likely late by ``time`` (s) than not at all."""
         return not self.replaced and self._fit.may_be_late(time)
+
+    def may_turn_late(self, time: float) -> bool:
+        """Whether the yaw rate that is used may be late by ``time`` (s), or early if negative."""
+        return not self.replaced and self._fit.may_turn_late(time)
 
     def reject(self) -> None:
         """Use the pose: by it the robot follows its commands, by the twist it does not."""

@@ -87,10 +87,10 @@ def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
     if wanted.namespace and not any(
         topic.startswith(f'{namespaces[0]}/') for topic in recording.topics
     ):
-        others = ', '.join(each or '/' for each in namespaces[1:]) or 'none with known topics'
+        known = ', '.join(each or '/' for each in namespaces[1:]) or 'none with known topics'
         raise ReportError(
             f'{recording.folder}: no topic is in the namespace {namespaces[0]}; namespaces in the '
-            f'bag: {others}'
+            f'bag: {known}'
         )
     filled = {name: topic for name, topic in recording.topics.items() if topic.message_count}
     chosen = {
