@@ -445,3 +445,20 @@ def shown(estimator, dead_time, deviation):
     estimate.dead_time, estimate.deviation = dead_time, deviation
     grid = GRID_STEP * np.arange(GRID_SIZE)
     estimate.accepted.costs = estimate.noise_ratio * ((grid - dead_time) / deviation) ** 2
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_mean_speed_tells_late_turns_from_a_dead_time(seed):
+    """A yaw rate that alone was 50 ms late was the dead time of the robot for some seconds."""
+    mean, half = smooth_commands(4.0, seed, rate=1.0)[:, :1], smooth_commands(4.0, 9 + seed)[:, :1]
+    command = np.hstack([mean + half, mean - half])
+    prompt, late = (simulate(command, each, seed).measured for each in (0.01, 0.06))
+    turns = 0.5 * (late[:, :1] - late[:, 1:])
+    turns_late = 0.5 * prompt.sum(axis=1, keepdims=True) + turns * [1.0, -1.0]
+    evidence = []
+    for measured in (late, turns_late):
+        estimator, _ = run(Drive(command, measured))
+        assert estimator.dead_time > 0.02  # by both wheels
+        evidence.append(estimator.linear_evidence(estimator.dead_time, 0.01))
+    assert evidence[0] < 0.0
+    assert evidence[1] > 4.0
