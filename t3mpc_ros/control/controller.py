@@ -944,14 +944,19 @@ class Controller:
         elif not self.disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
-        longer, twist = dead_time - self._dead_time, self.odometry_twist
-        if longer > MIN_DEAD_TIME_CHANGE and twist.may_be_late(longer):
+        longer = dead_time - self._dead_time
+        if longer > MIN_DEAD_TIME_CHANGE and self.odometry_twist.may_be_late(longer):
             return  # comparisons with the pose decide that first
-        if abs(longer) > MIN_DEAD_TIME_CHANGE:
-            against = self.dead_time.linear_evidence(dead_time, self._dead_time)
-            most = LINEAR_EVIDENCE[not twist.may_turn_late(longer)]
-            if against < most or not self.parameters.estimate_dead_time:
-                self._set_dead_time(dead_time)
+        if abs(longer) > MIN_DEAD_TIME_CHANGE and not self._is_by_turns_alone(dead_time):
+            self._set_dead_time(dead_time)
+
+    def _is_by_turns_alone(self, dead_time: float) -> bool:
+        """Whether the mean speed contradicts an estimated dead time (s): turns may be late."""
+        if not self.parameters.estimate_dead_time:
+            return False
+        open_to_doubt = self.odometry_twist.may_turn_late(dead_time - self._dead_time)
+        found, in_use = (each + self._excess_lag for each in (dead_time, self._dead_time))
+        return self.dead_time.linear_evidence(found, in_use) > LINEAR_EVIDENCE[not open_to_doubt]
 
     def _set_dead_time(self, dead_time: float) -> None:
         """Use a dead time (s); below 0 the robot responds before its lag has passed."""

@@ -269,9 +269,11 @@ class DeadTimeEstimator:
     def linear_evidence(self, dead_time: float, other: float) -> float:
         """Return 2 log of the likelihood ratio of another dead time and one, s, by the mean speed.
 
-        Where it contradicts what both wheels say, the yaw rate is late, or has another scale.
+        Both are without :attr:`lateness`. Where this contradicts what both wheels say, the yaw
+        rate is late, or has another scale.
         """
-        return self._linear(self._state, dead_time, other)
+        late = self.lateness
+        return self._linear(self._state, dead_time + late, other + late)
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
