@@ -197,6 +197,11 @@ def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
     )
 
 
+def rounded(link: Any, k: int, pose: Any) -> Mapping[str, float]:
+    """Return a pose with few digits."""
+    return {'x': round(pose.x, 3), 'y': round(pose.y, 3), 'yaw': round(pose.yaw, 2)}
+
+
 def frozen_yaw(link: Any, k: int, pose: Any) -> Mapping[str, float]:
     """Return the yaw of the begin of the fault."""
     if k == round(BEGIN * RATE):
@@ -264,6 +269,7 @@ FAULTS: Mapping[str, Fault] = {
     'pose 100 ms late': Fault(send=delayed(10, late_pose)),
     'pose 300 ms late': Fault(send=delayed(30, late_pose)),
     'pose ten times a second': Fault(send=held('pose', 10)),
+    'pose rounded to 1 mm, 0.01 rad': Fault(send=with_pose(rounded)),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
     ),

@@ -72,6 +72,9 @@ no yaw, or the wheels do not move the robot."""
 OUTLIER, RELATIVE_OUTLIER = 1.0, 0.3
 """Error of a single step (rad/s, and share of w_c) that is no property of the robot: a push, or a
 slip. Nothing is learnt from its block."""
+TORN, TORN_MEMORY = 0.3, 0.01
+"""Share of blocks with such a step from which the others are no fair sample, as of a yaw that is
+rounded: it stays the same in them. Weight of a block in it: 25 s of driving."""
 YAW_JUMP = 20.0
 """Error of a single step (rad/s) that is no motion: the yaw of the odometry was set."""
 STANDSTILL_SPEED = 0.05
@@ -181,6 +184,8 @@ class BodyMemory(Structure):
     achieved_sum: float  # sum of w_a
     square_sum: float  # sum of the squared commands of a wheel
     spoilt: bool  # whether nothing is learnt from the block
+    torn: bool  # whether a single step of it is no property of the robot
+    torn_share: float  # share of such blocks
     above: float
     below: float  # cumulative sums of positive and of negative innovations
     raw_power: float
@@ -215,7 +220,7 @@ WATCH = (
 """Fields of the present block that :func:`watch_block` uses."""
 DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
-    *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
+    *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt', 'torn'),
     *('before_achieved', 'last_achieved', 'last_rest'),
     *(*WATCH, 'rings', 'chain', 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'),
 )
@@ -562,8 +567,10 @@ def add_to_block(
     memory.steps += 1
     memory.achieved_sum += achieved * elapsed
     memory.square_sum += 0.5 * (right * right + left * left) * elapsed
-    if not learn or abs(achieved - commanded) > OUTLIER + RELATIVE_OUTLIER * abs(commanded):
+    if not learn:
         memory.spoilt = True
+    elif abs(achieved - commanded) > OUTLIER + RELATIVE_OUTLIER * abs(commanded):
+        memory.spoilt = memory.torn = True
 
 
 @kernel
@@ -574,7 +581,7 @@ def clear_block(state: BodyState) -> None:
     memory.rest_sum = memory.rest_square = memory.rest_product = memory.change_square = 0.0
     memory.largest_change = memory.slowest = 0.0
     memory.steps = 0
-    memory.spoilt = False
+    memory.spoilt = memory.torn = False
     state.sums[:] = 0.0
 
 
@@ -648,7 +655,8 @@ def learn_block(constants: BodyConstants, state: BodyState, rough: float) -> Non
     share = time / SKILL_TIME
     memory.raw_power += share * ((achieved - row[TURNING]) ** 2 - memory.raw_power)
     memory.command_power += share * (memory.square_sum / time - memory.command_power)
-    if memory.spoilt:
+    memory.torn_share += TORN_MEMORY * (memory.torn - memory.torn_share)
+    if memory.spoilt or memory.torn_share > TORN:
         update_authority(memory)
         return
     for j in range(ROWS):
@@ -695,7 +703,8 @@ def spread(row: Array, covariance: Array, gain: Array) -> float:
 @kernel
 def update_authority(memory: BodyMemory) -> None:
     """Set the authority from the powers."""
-    if memory.raw_power > IMPLAUSIBLE**2 * memory.command_power:
+    implausible = memory.raw_power > IMPLAUSIBLE**2 * memory.command_power
+    if implausible or memory.torn_share > TORN:
         memory.authority = 0.0
     elif memory.error_power > 0.0:
         skill = 1.0 - (memory.residual_power + DEAD_ZONE**2) / memory.error_power
