@@ -274,6 +274,12 @@ class VelocityFit:
         return time * (product - 0.5 * time * square) / (FIT_VARIANCE * self._noise)
 
     @property
+    def left_by_factor(self) -> float:
+        """Sum of the squares of the rate that a factor of the twist leaves."""
+        left = self._normal[0, 0] - self._product[0] ** 2 / max(self._square, 1e-12)
+        return float(left)
+
+    @property
     def _is_offset(self) -> bool:
         """Whether an offset alone, as that of a gyro, explains the twist as well."""
         offset = float(self._product[2] - self._normal[0, 2]) / self.rows
@@ -378,9 +384,6 @@ class TwistFit:
         self._held = HeldTwist()
         self._shifted = [0.0] * (EARLY_STEPS + 1)
         """Squared differences of the pose from the twist, by delays of the twist, (m/s)²."""
-        self._products = [[0.0] * 3 for _ in range(2)]
-        """Of each velocity: squares of the rate of the pose and of the twist, and product, (m/s)².
-        """
         self.driven = 0.0  # time for which the twist has been that of a robot that moves, s
         self._aside = self._interval = 0.0
         self._age = 0.0  # driving time since something was wrong, s
@@ -502,11 +505,6 @@ class TwistFit:
             linear, angular = self._history[-1 - i * step]
             apart = self._stages[0][1] - linear, STAMP_ARM * (self._stages[1][1] - angular)
             self._shifted[i] = kept * self._shifted[i] + apart[0] ** 2 + apart[1] ** 2
-        for i, sums in enumerate(self._products):
-            arm = STAMP_ARM if i else 1.0
-            rate, twist = arm * self._stages[i][1], arm * self._history[-1][i]
-            each = rate**2, twist**2, rate * twist
-            sums[:] = (kept * old + new for old, new in zip(sums, each, strict=True))
 
     @property
     def pose_lateness(self) -> float:
@@ -521,8 +519,8 @@ class TwistFit:
 
         While a robot gets faster, what it will do is what it does, times a factor.
         """
-        scaled = sum(rate - both**2 / max(twist, 1e-12) for rate, twist, both in self._products)
-        return EARLY * scaled < min(self._shifted)
+        linear, angular = (fit.left_by_factor for fit in self._fits)
+        return EARLY * (linear + STAMP_ARM**2 * angular) < min(self._shifted)
 
     def may_be_late(self, time: float) -> bool:
         """Whether the twist is more likely late by ``time`` (s) than not at all."""

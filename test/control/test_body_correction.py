@@ -449,7 +449,7 @@ def test_noise_of_the_gyro_is_neither_bias_nor_geometry(seed):
 @pytest.mark.compiled
 @pytest.mark.parametrize('start', range(0, 1000, 150))
 def test_a_yaw_in_steps_is_no_geometry(start):
-    """The first turns were learnt from as exact: 3.8 times the error on one reference of six."""
+    """Blocks without a step were learnt from: 3.8 times the error on one reference of six."""
     body = Body(exact)
     body.k, body.step = start, 0.01
     errors = body.run(30.0)
