@@ -46,7 +46,7 @@ def add_parser(commands: shared_options.Commands) -> None:
         '--planned',
         action='store_true',
         help='as --robot twin, and the path goes around what the robot has seen; the robot rests '
-        'and looks before floor that it has not; also with --safety',
+        'and looks before floor that it has not; also with --safety and --localization',
     )
     shared_options.add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
     text = (
@@ -155,7 +155,8 @@ def _compare_localizations(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.patrol import localization_study as study
 
     cases = options.paths or tuple(study.CASES)
-    plan = study.LocalizationPlan(cases, options.seeds, 60.0 * options.minutes)
+    seconds = 60.0 * options.minutes
+    plan = study.LocalizationPlan(cases, options.seeds, seconds, planned=options.planned)
     runs = options.output / f'localization{RUNS}'
     measure = partial(study.compare_localizations, plan, runs)
     return _print_table(options, measure, partial(study.markdown, plan))

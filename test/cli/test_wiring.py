@@ -419,6 +419,7 @@ TABLE = {
         {
             '--seeds 3-4': {'compare_localizations.plan.seeds': (3, 4)},
             '--minutes 2': {'compare_localizations.plan.duration': 120.0},
+            '--planned': {'compare_localizations.plan.planned': True},
             "--paths 'odometry alone'": {'compare_localizations.plan.cases': ('odometry alone',)},
             '--output new': {'compare_localizations.store': 'new/localization.runs.jsonl'},
             **workers('compare_localizations.workers'),

@@ -24,9 +24,11 @@ import pytest
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
+from t3mpc_ros.evaluation.patrol import localization_study
 from t3mpc_ros.evaluation.patrol.localization_study import (
     CASES,
     LocalizationPlan,
+    compare_localizations,
     localization_errors,
     lost_time,
     markdown,
@@ -99,7 +101,14 @@ def test_the_table_has_medians_and_counts():
     plan = LocalizationPlan(duration=120.0, seeds=(1, 2))
     row = {'position': 0.01, 'yaw': 0.01, 'largest': 0.03, 'lost': 0.0, 'deceived': 0.0}
     rows = [
-        {**row, 'controller': name, 'seed': seed, 'found': 50.0 * seed}
+        {
+            **row,
+            'on_path': 0.5 * seed,
+            'contacts': seed,
+            'controller': name,
+            'seed': seed,
+            'found': 50.0 * seed,
+        }
         for name in CASES
         for seed in plan.seeds
     ]
@@ -107,8 +116,19 @@ def test_the_table_has_medians_and_counts():
     assert '2 min in room' in lines[0]
     assert '| 10.0 (10.0) | 0.57 (0.57) | 30 (30) |' in lines[-1]
     assert '1 of 2' in lines[-1]
+    assert lines[-1].endswith('| 75.0 (50.0) | 3 |')
     with pytest.raises(ValueError, match='duration must be at least 90 s'):
         LocalizationPlan(duration=60.0)
+
+
+@pytest.mark.parametrize('planned', [False, True])
+def test_each_seed_drives_each_case_as_planned(monkeypatch, planned):
+    monkeypatch.setattr(localization_study, 'run_experiment', lambda runs, *_, **__: runs)
+    plan = LocalizationPlan(duration=120.0, seeds=(1, 2), planned=planned)
+    cases = [run.job[0] for run in compare_localizations(plan)]
+    assert len(cases) == 2 * len(CASES)
+    assert {(case.seed, case.duration) for case in cases} == {(1, 120.0), (2, 120.0)}
+    assert {case.plan.enabled for case in cases} == {planned}
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ The simulated robot drives its chaotic path by the pose in question, with the no
 oil on the floor, and a tenth of the commands lost.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 import math
@@ -27,12 +27,13 @@ from types import MappingProxyType
 import numpy as np
 
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Row, Run, run_experiment
 from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_cache_key import digest
-from t3mpc_ros.evaluation.run_record import ON_PATH, RATE, Record, spans_of
+from t3mpc_ros.evaluation.run_record import RATE, Record, spans_of
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import find_names
 
@@ -73,6 +74,8 @@ class LocalizationPlan:
     """s"""
     world: str = 'room'
     """Known room: a name or a file."""
+    planned: bool = False
+    """Whether the path goes around what is known."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'cases', find_names('case', self.cases, CASES))
@@ -90,10 +93,11 @@ def compare_localizations(
     report: Report | None = None,
 ) -> ResultTable:
     """Return a row for each case and seed; arguments as of :func:`run_experiment`."""
-    runs = []
+    runs, path = [], PlanParameters(enabled=plan.planned)
     for name in plan.cases:
+        known = replace(CASES[name], duration=plan.duration, known_world=plan.world, plan=path)
         for seed in plan.seeds:
-            case = replace(CASES[name], seed=seed, duration=plan.duration, known_world=plan.world)
+            case = replace(known, seed=seed)
             job = case, name
             runs.append(Run(job, {'controller': name, 'seed': seed}, digest(job)))
     return run_experiment(runs, measured_localization, workers, store=store, report=report)
@@ -113,7 +117,7 @@ def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
     ``largest`` position error up to then (m); ``lost``, time in which the robot was lost (s);
     ``found``, time from carrying until it was lost no more (s), infinite if it still was at the
     end; ``deceived``, time in which it was off by :data:`LOST_DISTANCE` and took its place for
-    known (s); ``on_path``, share of the time on the path; ``contacts``.
+    known (s); ``on_path``, share of the time on the path from the third minute on; ``contacts``.
     """
     apart = record['pose'] - record['truth']
     position = np.hypot(apart[:, 0], apart[:, 1])
@@ -131,7 +135,7 @@ def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
         'lost': lost_time(position),
         'found': found if math.isfinite(carried_at) else math.nan,
         'deceived': float((off & record['localized'].astype(np.bool_)).sum()) / RATE,
-        'on_path': float((patrol_run.path_error(record) < ON_PATH).mean()),
+        'on_path': patrol_run.share_on_path(record),
         'contacts': patrol_run.contact_count(record),
     }
 
@@ -143,11 +147,13 @@ def lost_time(position: Array) -> float:
 
 
 def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
-    """Return the medians, with the largest of all seeds in brackets, as a table in Markdown."""
+    """Return the medians, with the worst of all seeds in brackets, as a table in Markdown."""
 
-    def cell(name: str, column: str, scale: float, digits: int) -> str:
+    def cell(
+        name: str, column: str, scale: float, digits: int, worst: Callable[..., float] = max
+    ) -> str:
         values = [scale * value for value in table.values(column, controller=name)]
-        return f'{np.median(values):.{digits}f} ({max(values):.{digits}f})'
+        return f'{np.median(values):.{digits}f} ({worst(values):.{digits}f})'
 
     rows = []
     for name in plan.cases:
@@ -163,6 +169,8 @@ def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
                 '' if carried else cell(name, 'lost', 1.0, 0),
                 f'{again} of {len(times)}' if carried else '',
                 cell(name, 'deceived', 1.0, 1),
+                cell(name, 'on_path', 100.0, 1, min),
+                f'{sum(table.values("contacts", controller=name)):.0f}',
             )
         )
     head = (
@@ -173,9 +181,12 @@ def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
         'lost, s',
         f'found within {FOUND_WITHIN:g} s',
         'wrong and sure, s',
+        'on its path from minute 3 on, %',
+        'contacts',
     )
+    planned = ', planned path' if plan.planned else ''
     title = (
-        f'{plan.duration / 60.0:g} min in {plan.world}, {len(plan.seeds)} seeds from '
-        f'{plan.seeds[0]}: median (largest)'
+        f'{plan.duration / 60.0:g} min in {plan.world}{planned}, {len(plan.seeds)} seeds from '
+        f'{plan.seeds[0]}: median (worst)'
     )
     return Table(title, head, rows).markdown()
