@@ -65,7 +65,9 @@ SKILL_TIME = 5.0  # time constant of the measured skill, s
 DEAD_ZONE = 0.010
 """Error of a wheel that is not worth correcting, rad/s: noise of the gyro and of the rotors,
 averaged over a block."""
-FULL_SKILL, NO_SKILL = 0.6, 0.2  # skill from which on the authority is 1, and up to which it is 0
+FULL_SKILL, NO_SKILL = 0.85, 0.2
+"""Skill from which on the authority is 1, and up to which it is 0. With a smaller first one a gyro
+whose scale is off by more than is stated costs more, a wrong body less."""
 IMPLAUSIBLE = 0.2
 """Error relative to the commanded wheel speeds above which nothing is corrected: the odometry has
 no yaw, or the wheels do not move the robot."""
