@@ -13,7 +13,7 @@
 # limitations under the License.
 """Roles of the topics of a bag: odometry, command, reference, ground truth."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -84,47 +84,22 @@ class TopicChoice:
 def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
     """Return the topic of each role."""
     names, namespaces = find_topics(recording.topics, wanted.namespace)
-    if wanted.namespace and not any(
-        topic.startswith(f'{namespaces[0]}/') for topic in recording.topics
-    ):
-        known = ', '.join(each or '/' for each in namespaces[1:]) or 'none with known topics'
-        raise ReportError(
-            f'{recording.folder}: no topic is in the namespace {namespaces[0]}; namespaces in the '
-            f'bag: {known}'
-        )
+    if wanted.namespace:
+        _check_namespace(recording, namespaces)
     filled = {name: topic for name, topic in recording.topics.items() if topic.message_count}
     chosen = {
         name: full
         for name, full in names.items()
         if full in filled and filled[full].type_name in KINDS[name]
     }
-    for name, full in (
-        (ODOMETRY, wanted.odom),
-        (COMMAND, wanted.cmd_vel),
-        (REFERENCE, wanted.reference),
-    ):
+    given = {ODOMETRY: wanted.odom, COMMAND: wanted.cmd_vel, REFERENCE: wanted.reference}
+    for name, full in given.items():
         if full:
             chosen[name] = _requested_topic(recording, name, full)
     if wanted.odom and not wanted.namespace:
         chosen.pop(TRUTH, None)  # errors refer to the given topic
-    notes = []
-    for name, given, what, option in (
-        (ODOMETRY, wanted.odom, 'Odometry', '--odom'),
-        (COMMAND, wanted.cmd_vel, 'The command', '--cmd-vel'),
-    ):
-        if given:
-            continue
-        others = _candidates(name, filled.values(), chosen, wanted.namespace, namespaces[0])
-        by_name = name in chosen
-        if not by_name and others:
-            chosen[name] = others.pop(0)
-        if others or (name in chosen and not by_name):
-            rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
-            notes.append(f'{what} is taken from {chosen[name]}{rest}.')
-    for name, full in chosen.items():
-        others = [other for other, topic in chosen.items() if topic == full and other != name]
-        if others:
-            raise ReportError(f'{full} is given as {name} and as {others[0]}: choose another one')
+    notes = _choose_by_type(chosen, filled.values(), wanted, namespaces[0])
+    _check_distinct(chosen)
     if not chosen:
         raise ReportError(
             f'{recording.folder}: there is nothing to report: no message of odometry '
@@ -133,6 +108,48 @@ def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
         )
     ours = bool({REFERENCE, SIGNALS, *SCALARS} & set(chosen)) and not wanted.reference
     return TopicChoice(chosen, namespaces, ours, tuple(notes))
+
+
+def _check_namespace(recording: 'BagReader', namespaces: Sequence[str]) -> None:
+    """Raise ReportError unless a topic is in the first namespace."""
+    if not any(topic.startswith(f'{namespaces[0]}/') for topic in recording.topics):
+        known = ', '.join(each or '/' for each in namespaces[1:]) or 'none with known topics'
+        raise ReportError(
+            f'{recording.folder}: no topic is in the namespace {namespaces[0]}; namespaces in the '
+            f'bag: {known}'
+        )
+
+
+def _choose_by_type(
+    chosen: dict[str, str],
+    topics: 'Iterable[TopicInformation]',
+    wanted: ReportOptions,
+    preferred: str,
+) -> list[str]:
+    """Choose odometry and command by their type where no topic has their name; return notes."""
+    notes = []
+    for name, given, what, option in (
+        (ODOMETRY, wanted.odom, 'Odometry', '--odom'),
+        (COMMAND, wanted.cmd_vel, 'The command', '--cmd-vel'),
+    ):
+        if given:
+            continue
+        others = _candidates(name, topics, chosen, wanted.namespace, preferred)
+        by_name = name in chosen
+        if not by_name and others:
+            chosen[name] = others.pop(0)
+        if others or (name in chosen and not by_name):
+            rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
+            notes.append(f'{what} is taken from {chosen[name]}{rest}.')
+    return notes
+
+
+def _check_distinct(chosen: Mapping[str, str]) -> None:
+    """Raise ReportError if two roles have the same topic."""
+    for name, full in chosen.items():
+        others = [other for other, topic in chosen.items() if topic == full and other != name]
+        if others:
+            raise ReportError(f'{full} is given as {name} and as {others[0]}: choose another one')
 
 
 def _candidates(
