@@ -248,23 +248,10 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, oddities)
     scalars = _recomputed_scalars(recording, choice, notes)
-    motions: dict[str, Series] = {}
-    numbers: dict[str, Series] = {}
-    for name, table in {**raw, **scalars}.items():
-        if name == SIGNALS:
-            time = clock.local(table['received']) + clock.lead  # for which they were sent
-            numbers |= {key: Series(time, {'value': table[key]}) for key in SIGNAL_NAMES}
-        elif name in SCALARS:
-            numbers[name] = Series(clock.local(table['received']), {'value': table['value']})
-        elif name == COMMAND or 'x' not in table:
-            motions[name] = _motion(clock.local(table['received']), table, geometry)
-        else:
-            motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
-        if name in (ODOMETRY, TRUTH) and _lacks_twist(motions[name]):
-            motions[name] = _differentiated(motions[name], geometry)
-            text = f'The twist of {topics[name]} is zero while its pose moves'
-            doubts.append(f'{text}: its speeds are those of the pose.')
-            oddities.append(doubts[-1])
+    motions, numbers = _on_one_axis({**raw, **scalars}, clock, geometry)
+    without_twist = _differentiate_poses(motions, topics, geometry)
+    doubts += without_twist
+    oddities += without_twist
     oddities += _oddities_of_motions(topics, raw, motions)
     complaints, changes, links, reports = diagnostic_history.read_diagnostics(
         recording, choice.namespaces[0]
@@ -311,6 +298,38 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         parameters=records,
         follows_path=records.get('controller', {}).get('pose.enabled', '').lower() == 'true',
     )
+
+
+def _on_one_axis(
+    tables: Mapping[str, Mapping[str, Array]], clock: '_Clock', geometry: WheelGeometry | None
+) -> tuple[dict[str, Series], dict[str, Series]]:
+    """Return the motions by relative name, and the numbers; see :class:`Run`."""
+    motions: dict[str, Series] = {}
+    numbers: dict[str, Series] = {}
+    for name, table in tables.items():
+        if name == SIGNALS:
+            time = clock.local(table['received']) + clock.lead  # for which they were sent
+            numbers |= {key: Series(time, {'value': table[key]}) for key in SIGNAL_NAMES}
+        elif name in SCALARS:
+            numbers[name] = Series(clock.local(table['received']), {'value': table['value']})
+        elif name == COMMAND or 'x' not in table:
+            motions[name] = _motion(clock.local(table['received']), table, geometry)
+        else:
+            motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
+    return motions, numbers
+
+
+def _differentiate_poses(
+    motions: dict[str, Series], topics: Mapping[str, str], geometry: WheelGeometry | None
+) -> list[str]:
+    """Replace the speeds of a motion without a twist by those of its pose; return sentences."""
+    found = []
+    for name in motions:
+        if name in (ODOMETRY, TRUTH) and _lacks_twist(motions[name]):
+            motions[name] = _differentiated(motions[name], geometry)
+            text = f'The twist of {topics[name]} is zero while its pose moves'
+            found.append(f'{text}: its speeds are those of the pose.')
+    return found
 
 
 def _oddities_of_bag(
@@ -516,13 +535,7 @@ def _read(
     Rows that are not finite are left out, but for the receive times between both.
     """
     kind = recording.topics[topic].type_name
-    if kind.endswith(('/Twist', '/TwistStamped')):
-        inner = 'twist.' if kind.endswith('Stamped') else ''
-        fields = {key: inner + field for key, field in _TWIST_FIELDS.items()}
-    elif name == SIGNALS:
-        fields = {signal: f'data[{i}]' for i, signal in enumerate(SIGNAL_NAMES)}
-    else:
-        fields = {'value': 'data'} if name in SCALARS else _ODOMETRY_FIELDS
+    fields = _fields(name, kind)
     if column is None:
         table = recording.series(topic, fields)
     else:
@@ -536,37 +549,56 @@ def _read(
         text = f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not finite'
         (notes if np.mean(sound) > MOST else doubts).append(f'{text}; they are excluded.')
     table = {key: values[sound] for key, values in table.items()}
-    damage = {}
-    if fields is _ODOMETRY_FIELDS:
-        times = table['received'], table['stamp']
-        places = np.stack([table['x'], table['y']], axis=1)
-        notes += continuity_notes(topic, *times, places, table['linear'])
-        jumps = pose_jumps(table['stamp'], places, table['linear'], MIXED_STEP)
-        often = len(jumps) > max(MIN_JUMPS, MIXED_SHARE * len(places))
-        _mend_stamps(table, topic, notes, doubts)
-        turned = [table.pop(key) for key in ('about x', 'about y')] + [table['z'], table['w']]
-        blind = np.count_nonzero(~np.any(turned, axis=0))
-        if often:
-            text = (
-                f'The position of {topic} jumps between its messages: several robots publish it, '
-                'or its pose disagrees with its twist; nothing measured from it is valid'
-            )
-            damage[text] = 'Give each robot a namespace, or correct the units in its driver.'
-        elif name != REFERENCE and blind:
-            doubts.append(
-                f'{blind} of {places.shape[0]} quaternions of {topic} are zero: its direction is '
-                'not known there.'
-            )
-        elif name != REFERENCE:
-            poses = np.column_stack([places, _yaw(table)])
-            twists = np.column_stack([table['linear'], table['angular']])
-            if example := other_units(table['stamp'], poses, twists):
-                text = (
-                    f'The twist of {topic} cannot be in m/s and rad/s: {example}; nothing '
-                    'measured from it is valid'
-                )
-                damage[text] = 'Correct the units in its driver, or see why wheels spin.'
-    return table, received, damage
+    if fields is not _ODOMETRY_FIELDS:
+        return table, received, {}
+    return table, received, _damage_of_odometry(name, topic, table, notes, doubts)
+
+
+def _fields(name: str, kind: str) -> dict[str, str]:
+    """Return the fields of the messages of a type that a relative name needs, by key."""
+    if kind.endswith(('/Twist', '/TwistStamped')):
+        inner = 'twist.' if kind.endswith('Stamped') else ''
+        return {key: inner + field for key, field in _TWIST_FIELDS.items()}
+    if name == SIGNALS:
+        return {signal: f'data[{i}]' for i, signal in enumerate(SIGNAL_NAMES)}
+    return {'value': 'data'} if name in SCALARS else _ODOMETRY_FIELDS
+
+
+def _damage_of_odometry(
+    name: str, topic: str, table: dict[str, Array], notes: list[str], doubts: list[str]
+) -> dict[str, str]:
+    """Return why nothing of an odometry is valid, if so, with the remedy; mend its stamps."""
+    times = table['received'], table['stamp']
+    places = np.stack([table['x'], table['y']], axis=1)
+    notes += continuity_notes(topic, *times, places, table['linear'])
+    jumps = pose_jumps(table['stamp'], places, table['linear'], MIXED_STEP)
+    often = len(jumps) > max(MIN_JUMPS, MIXED_SHARE * len(places))
+    _mend_stamps(table, topic, notes, doubts)
+    turned = [table.pop(key) for key in ('about x', 'about y')] + [table['z'], table['w']]
+    blind = np.count_nonzero(~np.any(turned, axis=0))
+    if often:
+        text = (
+            f'The position of {topic} jumps between its messages: several robots publish it, '
+            'or its pose disagrees with its twist; nothing measured from it is valid'
+        )
+        return {text: 'Give each robot a namespace, or correct the units in its driver.'}
+    if name == REFERENCE:
+        return {}
+    if blind:
+        doubts.append(
+            f'{blind} of {places.shape[0]} quaternions of {topic} are zero: its direction is '
+            'not known there.'
+        )
+        return {}
+    poses = np.column_stack([places, _yaw(table)])
+    twists = np.column_stack([table['linear'], table['angular']])
+    if example := other_units(table['stamp'], poses, twists):
+        text = (
+            f'The twist of {topic} cannot be in m/s and rad/s: {example}; nothing '
+            'measured from it is valid'
+        )
+        return {text: 'Correct the units in its driver, or see why wheels spin.'}
+    return {}
 
 
 def _yaw(table: Mapping[str, Array]) -> Array:
