@@ -343,39 +343,48 @@ def find_stops(run: Run) -> tuple[Stop, ...]:
     of a stop. After the last command to move it counts only if the nodes gave a
     reason, and only up to the end of the reference: a drive that is over is no stop.
     """
-    motion, wanted = run.motion, run.motions.get(REFERENCE)
-    command = run.motions.get(COMMAND)
+    motion, command = run.motion, run.motions.get(COMMAND)
     first, last = driving(run)
     if motion is None or len(motion) < 3 or not (first < last or command is None):
         return ()
-    demand = command if wanted is None or len(wanted) < 2 else wanted
+    demand, end = _demand(run)
     if demand is None:
         return ()
-    end = float(demand.time[-1])
-    if REFERENCE in run.receipts and demand is wanted:
-        # It is stamped ahead: the robot cannot follow what is left when the generator ends.
-        end = min(end, end - run.lead)
     commanded = [] if command is None else _commanded_stops(command.between(first, last))
     found = []
     for low, high in standstills(motion):
         start, stop = max(low, first), min(high, end)
         start = max(_begin_of_stop(motion, command or demand, low), first)
         by_command = [each for each in commanded if each[0] <= stop and low <= each[1] + BRAKING]
-        if by_command and demand is wanted:
+        if by_command and demand is not command:
             start = max(min(start, by_command[0][0]), low - BRAKING, first)
         elif stop - start < PAUSE:
             continue
         asked = asks_for_motion(demand, np.linspace(start, stop, 50))
         if not (start < stop and np.mean(asked) >= 0.5):
             continue
-        cause = cause_between(
-            run.changes, start, stop, present=_present(run, start - BRAKING, stop),
-            reported=bool(np.any((run.reports > start) & (run.reports < stop + REASON_WINDOW))),
-        )  # fmt: skip
+        cause = _reported_cause(run, start, stop)
         if start >= last - PAUSE and not cause.known:
             continue
         found.append(Stop(start, stop, cause))
     return tuple(found)
+
+
+def _demand(run: Run) -> tuple[Series | None, float]:
+    """Return the reference, or the command where there is none, and when it ends, s."""
+    reference, command = run.motions.get(REFERENCE), run.motions.get(COMMAND)
+    if reference is None or len(reference) < 2:
+        return command, math.inf if command is None else float(command.time[-1])
+    end = float(reference.time[-1])
+    # It is stamped ahead: the robot cannot follow what is left when the generator ends.
+    return reference, min(end, end - run.lead) if REFERENCE in run.receipts else end
+
+
+def _reported_cause(run: Run, start: float, stop: float) -> Cause:
+    """Return why the robot stood, by the nodes that report and the topics that went on."""
+    reported = np.any((run.reports > start) & (run.reports < stop + REASON_WINDOW))
+    present = _present(run, start - BRAKING, stop)
+    return cause_between(run.changes, start, stop, present=present, reported=bool(reported))
 
 
 def _present(run: Run, start: float, end: float) -> list[str]:
@@ -455,25 +464,36 @@ def find_stalls(run: Run) -> list[Span]:
     commands = run.receipts.get(COMMAND) if run.ours else None
     if commands is not None and commands.size > 2:
         least = max(least, STALL_PERIODS * float(np.median(np.diff(commands))))
-        found += [
-            (low, high)
-            for low, high in _pauses(commands, least)
-            if _received(odometry, low, high) and _come_late(commands, odometry, low, high)
-        ]
+        found += _pauses_of_commands(commands, odometry, least)
     going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
     others = [run.receipts[name] for name in going_on if name in run.receipts]
     found = [span for span in found if not any(_received(each, *span) for each in others)]
     if commands is not None:
-        index = np.searchsorted(odometry, commands, 'right') - 1
-        prompt = (index >= 0) & (np.diff(index, prepend=-1) > 0)
-        late, asked = commands[prompt], odometry[index[prompt]]
-        slow = (late - asked > least) & (late - asked < MIN_GAP)
-        found += zip(asked[slow].tolist(), late[slow].tolist(), strict=True)
-    lost = [(low - least, high + least) for low, high in run.lost]
-    found = [
-        span for span in found if not any(low < span[1] and span[0] < high for low, high in lost)
+        found += _late_commands(commands, odometry, least)
+    return merged([span for span in found if not _is_unread(run, *span, least)], -1e-6)
+
+
+def _pauses_of_commands(commands: Array, odometry: Array, least: float) -> list[Span]:
+    """Return the spans between two commands in which odometry comes, and that they follow."""
+    return [
+        (low, high)
+        for low, high in _pauses(commands, least)
+        if _received(odometry, low, high) and _come_late(commands, odometry, low, high)
     ]
-    return merged(found, -1e-6)
+
+
+def _late_commands(commands: Array, odometry: Array, least: float) -> list[Span]:
+    """Return the spans from a message of odometry to its command longer than ``least``, s."""
+    index = np.searchsorted(odometry, commands, 'right') - 1
+    prompt = (index >= 0) & (np.diff(index, prepend=-1) > 0)
+    late, asked = commands[prompt], odometry[index[prompt]]
+    slow = (late - asked > least) & (late - asked < MIN_GAP)
+    return list(zip(asked[slow].tolist(), late[slow].tolist(), strict=True))
+
+
+def _is_unread(run: Run, start: float, end: float, least: float) -> bool:
+    """Return whether a span is within ``least`` s of what a recovery could not read."""
+    return any(low - least < end and start < high + least for low, high in run.lost)
 
 
 def _come_late(commands: Array, odometry: Array, low: float, high: float) -> bool:
@@ -549,16 +569,7 @@ def find_carried(run: Run) -> tuple[Carried, ...]:
 
     The localizer of this package corrects the odometry by the map: then it counts for nothing.
     """
-    motions = {
-        name: motion
-        for name in (TRUTH, ODOMETRY)
-        if (motion := run.motions.get(name)) is not None
-        and len(motion) > 2
-        and 'x' in motion.values
-        and name not in run.untrusted
-        and np.ptp(motion['yaw'])  # else it has no pose
-        and not (name == ODOMETRY and 'localizer' in run.parameters)
-    }
+    motions = _with_pose(run)
     pairs = [
         (name, 'its twist', each.time, _poses(each, each.time), _moves_by_twist(each))
         for name, each in motions.items()
@@ -580,6 +591,20 @@ def find_carried(run: Run) -> tuple[Carried, ...]:
                 times.append(each.start)
                 found.append(Carried(each.start, name, against, each))
     return tuple(sorted(found))
+
+
+def _with_pose(run: Run) -> dict[str, Series]:
+    """Return ground truth and odometry where they have a pose that is measured."""
+    return {
+        name: motion
+        for name in (TRUTH, ODOMETRY)
+        if (motion := run.motions.get(name)) is not None
+        and len(motion) > 2
+        and 'x' in motion.values
+        and name not in run.untrusted
+        and np.ptp(motion['yaw'])  # else it has no pose
+        and not (name == ODOMETRY and 'localizer' in run.parameters)
+    }
 
 
 def _poses(motion: Series, time: Array | float) -> Array:
