@@ -304,7 +304,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     shown = _motions(run, ODOMETRY, TRUTH)
     if not shown:
         return
-    base, curves, marks = run.motions[run.measured], [], []
+    curves = []
     for name, motion in shown.items():
         x, y = _on_floor(run) if name == ODOMETRY else (motion['x'], motion['y'])
         positions = np.stack([x, y], axis=1)
@@ -313,24 +313,45 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     measured = curves[-1]
     reference = run.motions.get(REFERENCE)
     if is_long(reference):
-        if followed_reference(run) is not None:
-            x, y = reference['x'], reference['y']
-        else:
-            first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
-            x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
-        curves.insert(0, _curve(REFERENCE, reference, x, y))
-    if slips := metrics.incidents.slips:
+        curves.insert(0, _curve(REFERENCE, reference, *_reference_path(run, reference)))
+    slips = metrics.incidents.slips
+    if slips:
         among = [(start <= measured.time) & (measured.time <= end) for start, end in slips]
         slipping = np.any(among, axis=0)
         x, y = (np.where(slipping, each, np.nan) for each in (measured.x, measured.y))
         curves.append(Curve('a wheel slips', 'slip', measured.time, x, y))
     stops = [start for start, kind, _ in metrics.incidents.events() if kind == 'stop']
+    marks = _path_marks(run, measured, stops)
+    seen = _path_summary(run, measured, slips, stops)
+    yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)
+
+
+def _reference_path(run: Run, reference: Series) -> tuple[Array, Array]:
+    """Return the poses that the robot follows, or the speeds integrated from where it is first."""
+    if followed_reference(run) is not None:
+        return reference['x'], reference['y']
+    base = run.motions[run.measured]
+    first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
+    return path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
+
+
+def _path_marks(
+    run: Run, measured: Curve, stops: Sequence[float]
+) -> list[tuple[float, float, float, str]]:
+    """Return time, x, y and colour of the switches, the stops and what contradicts the map."""
+    marks = []
     for times, colour in ((run.switches, 'switch'), (np.array(stops), 'stopped')):
         rows = np.searchsorted(measured.time, times[:200])
         rows = rows[rows < measured.time.size]
         columns = np.stack([measured.time, measured.x, measured.y], axis=1)[rows]
         marks += [(*mark, colour) for mark in columns[np.isfinite(columns).all(axis=1)].tolist()]
-    marks += [(each.found, each.x, each.y, 'fault') for each in run.map_changes]
+    return marks + [(each.found, each.x, each.y, 'fault') for each in run.map_changes]
+
+
+def _path_summary(
+    run: Run, measured: Curve, slips: Sequence[tuple[float, float]], stops: Sequence[float]
+) -> str:
+    """Return what is seen of the paths, in sentences."""
     x, y = measured.x[np.isfinite(measured.x)], measured.y[np.isfinite(measured.y)]
     seen = (
         f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
@@ -340,17 +361,14 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
         seen = f'Nothing measured from {run.topics[run.measured]} is valid.'
     if slips:
         seen += f' A wheel slips for {sum(end - start for start, end in slips):.1f} s.'
-    if named := [
-        name
-        for name, found in (
-            ('switches', run.switches),
-            ('stops', stops),
-            ('what contradicts the map', run.map_changes),
-        )
-        if len(found)
-    ]:
+    found = {
+        'switches': run.switches,
+        'stops': stops,
+        'what contradicts the map': run.map_changes,
+    }
+    if named := [name for name, each in found.items() if len(each)]:
         seen += f' Points: {" and ".join(named)}.'
-    yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)
+    return seen
 
 
 def _curve(
