@@ -21,9 +21,9 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.bag_report.incidents import UNDER_WAY, exceeds
+from t3mpc_ros.evaluation.bag_report.incidents import UNDER_WAY, Incidents, exceeds
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
-from t3mpc_ros.evaluation.bag_report.recorded_run import load_run
+from t3mpc_ros.evaluation.bag_report.recorded_run import Run, load_run
 from t3mpc_ros.evaluation.topic_roles import ReportOptions, bag_display_name
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.simulation.world import world_outline
@@ -43,46 +43,8 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
         data.set('origin', recording.start_ns / NANOSECONDS)
     if 'odom' not in run.motions:
         raise ValueError(f'{bag} has no odometry to show; t3mpc bag info lists its topics')
-    channels = tuple(each.name for each in run.channels)
-    motion = (*channels, 'x', 'y', 'yaw')
-    shown = {
-        'odometry': ('odom', motion),
-        'truth': ('ground_truth/odom', motion),
-        'reference': ('reference', motion),
-        'command': ('cmd_vel', channels),
-    }
-    absent = [
-        'preview',
-        *(stream for stream, (topic, _) in shown.items() if topic not in run.motions),
-    ]
-    for stream, (topic, names) in shown.items():
-        if topic in run.motions:
-            series = run.motions[topic]
-            unknown = np.full(len(series), math.nan)  # a reference may have speeds only
-            columns = [series.values.get(name, unknown) for name in names]
-            _add_columns(data, stream, series.time, columns)
-    terms = [
-        run.numbers.get(f'controller/terms/{term}/{wheel}')
-        for term in TERM_NAMES
-        for wheel in ('right', 'left')
-    ]
-    if first := terms[0]:
-        columns = [
-            np.interp(first.time, each.time, each['value'])
-            if each
-            else np.full(len(first), np.nan)
-            for each in terms
-        ]
-        _add_columns(data, 'terms', first.time, columns)
-    else:
-        absent.append('terms')
-    events = [(time, 'switch', 'switch of the reference') for time in run.switches.tolist()]
-    events += [(when, 'note', f'{node}: {text}') for when, _, node, text in run.complaints]
-    for stop in incidents.stops:
-        later = run.motions[run.measured].between(stop.end, math.inf)
-        if exceeds(later, UNDER_WAY).any():
-            events.append((stop.end, 'resume', 'the robot moves again'))
-    for event in sorted(events + incidents.events()):
+    absent = ['preview', *_add_motions(data, run), *_add_terms(data, run)]
+    for event in sorted(_events(run, incidents)):
         data.report(*event)
     data.set('absent', absent)
     data.set('channels', [[each.title.capitalize(), each.unit] for each in run.channels])
@@ -107,6 +69,54 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
     )
     data.set('recording', {'duration': run.duration})
     return data
+
+
+def _add_motions(data: LiveData, run: Run) -> list[str]:
+    """Add the samples of each recorded motion; return the streams that are absent."""
+    channels = tuple(each.name for each in run.channels)
+    motion = (*channels, 'x', 'y', 'yaw')
+    shown = {
+        'odometry': ('odom', motion),
+        'truth': ('ground_truth/odom', motion),
+        'reference': ('reference', motion),
+        'command': ('cmd_vel', channels),
+    }
+    for stream, (topic, names) in shown.items():
+        if topic in run.motions:
+            series = run.motions[topic]
+            unknown = np.full(len(series), math.nan)  # a reference may have speeds only
+            columns = [series.values.get(name, unknown) for name in names]
+            _add_columns(data, stream, series.time, columns)
+    return [stream for stream, (topic, _) in shown.items() if topic not in run.motions]
+
+
+def _add_terms(data: LiveData, run: Run) -> list[str]:
+    """Add the terms of the control law at the times of the first; return the stream if absent."""
+    terms = [
+        run.numbers.get(f'controller/terms/{term}/{wheel}')
+        for term in TERM_NAMES
+        for wheel in ('right', 'left')
+    ]
+    first = terms[0]
+    if not first:
+        return ['terms']
+    columns = [
+        np.interp(first.time, each.time, each['value']) if each else np.full(len(first), np.nan)
+        for each in terms
+    ]
+    _add_columns(data, 'terms', first.time, columns)
+    return []
+
+
+def _events(run: Run, incidents: Incidents) -> list[tuple[float, str, str]]:
+    """Return what happened, as of :meth:`LiveData.report`."""
+    events = [(time, 'switch', 'switch of the reference') for time in run.switches.tolist()]
+    events += [(when, 'note', f'{node}: {text}') for when, _, node, text in run.complaints]
+    for stop in incidents.stops:
+        later = run.motions[run.measured].between(stop.end, math.inf)
+        if exceeds(later, UNDER_WAY).any():
+            events.append((stop.end, 'resume', 'the robot moves again'))
+    return events + incidents.events()
 
 
 def _add_columns(data: LiveData, stream: str, time: Array, columns: Sequence[Array]) -> None:
