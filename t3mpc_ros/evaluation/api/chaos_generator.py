@@ -120,30 +120,9 @@ def chaos(
     ScriptError
         An argument is out of range, or the solution is not finite.
     """
-    try:
-        begin, end = (float(time) for time in tspan)
-    except (TypeError, ValueError):
-        raise ScriptError(f'tspan must be two times in s: got {tspan!r}') from None
-    if not (math.isfinite(begin) and begin < end < math.inf):
-        raise ScriptError(f'tspan must ascend: got {tspan!r}')
-    if dt is not None and not (isinstance(dt, int | float) and 0.0 < dt <= end - begin):
-        raise ScriptError(f'dt must be above 0 s and at most the span: got {dt!r}')
-    if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
-        raise ScriptError(f'every must be a whole number, at least 1: got {every!r}')
-    if not (isinstance(rtol, int | float) and MIN_RTOL <= rtol <= 1.0):
-        raise ScriptError(f'rtol must be from {MIN_RTOL:g} to 1: got {rtol!r}')
-    if system is None:
-        orders = numbers('alpha', alpha, '() or (4,)')
-        if orders.shape not in ((), (1,), (4,)):
-            raise ScriptError(f'alpha must be one order or four: got {orders.tolist()}')
-        if not (np.all(orders > 0.0) and np.all(orders <= 1.0)):
-            raise ScriptError(f'alpha must be above 0 and at most 1: got {alpha!r}')
-        chosen = hyperchaotic_system(orders=tuple(np.broadcast_to(orders, 4).tolist()))
-        start = np.array(ReferenceParameters().initial)
-    elif isinstance(system, QuadraticSystem):
-        chosen, start = system, np.ones(system.size)
-    else:
-        raise ScriptError(f'system must be a QuadraticSystem: got {system!r}')
+    begin, end = _span(tspan)
+    _check_steps(dt, every, rtol, end - begin)
+    chosen, start = _system(alpha, system)
     initial = start if y0 is None else numbers('y0', y0, f'({chosen.size},)')
     if initial.shape != (chosen.size,):
         raise ScriptError(f'y0 must have the shape ({chosen.size},): got {initial.shape}')
@@ -152,6 +131,44 @@ def chaos(
     states = _solve(chosen, initial, step, rows, end - begin)
     times: Array = begin + step * rows * np.arange(len(states), dtype=np.float64)
     return ChaosSolution(read_only(times), read_only(states), chosen, step)
+
+
+def _span(tspan: tuple[float, float]) -> tuple[float, float]:
+    """Return first and last time, s, or raise ScriptError."""
+    try:
+        begin, end = (float(time) for time in tspan)
+    except (TypeError, ValueError):
+        raise ScriptError(f'tspan must be two times in s: got {tspan!r}') from None
+    if not (math.isfinite(begin) and begin < end < math.inf):
+        raise ScriptError(f'tspan must ascend: got {tspan!r}')
+    return begin, end
+
+
+def _check_steps(dt: float | None, every: int | None, rtol: float, span: float) -> None:
+    """Raise ScriptError for a step, a number of steps or a tolerance that is out of range."""
+    if dt is not None and not (isinstance(dt, int | float) and 0.0 < dt <= span):
+        raise ScriptError(f'dt must be above 0 s and at most the span: got {dt!r}')
+    if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
+        raise ScriptError(f'every must be a whole number, at least 1: got {every!r}')
+    if not (isinstance(rtol, int | float) and MIN_RTOL <= rtol <= 1.0):
+        raise ScriptError(f'rtol must be from {MIN_RTOL:g} to 1: got {rtol!r}')
+
+
+def _system(
+    alpha: float | Sequence[float], system: QuadraticSystem | None
+) -> tuple[QuadraticSystem, Array]:
+    """Return what is solved and its default initial state, or raise ScriptError."""
+    if isinstance(system, QuadraticSystem):
+        return system, np.ones(system.size)
+    if system is not None:
+        raise ScriptError(f'system must be a QuadraticSystem: got {system!r}')
+    orders = numbers('alpha', alpha, '() or (4,)')
+    if orders.shape not in ((), (1,), (4,)):
+        raise ScriptError(f'alpha must be one order or four: got {orders.tolist()}')
+    if not (np.all(orders > 0.0) and np.all(orders <= 1.0)):
+        raise ScriptError(f'alpha must be above 0 and at most 1: got {alpha!r}')
+    chosen = hyperchaotic_system(orders=tuple(np.broadcast_to(orders, 4).tolist()))
+    return chosen, np.array(ReferenceParameters().initial)
 
 
 def _solve(system: QuadraticSystem, initial: Array, dt: float, every: int, span: float) -> Array:
