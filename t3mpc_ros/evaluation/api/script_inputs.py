@@ -450,27 +450,8 @@ def own_scenario(
     of :class:`Scenario`. ValueError: wrong use, an unknown name, or a number out of range.
     """
     own_plant = plant if isinstance(plant, OdePlant | StateSpace) else None
-    own = plant if isinstance(plant, Robot) else None
-    if isinstance(plant, str):
-        (robot,) = find_names('plant', [plant], ROBOTS)
-        text = KINDS[robot].text
-    elif own is not None:
-        robot, text = 'servo', 'Your robot'
-    elif own_plant is not None:
-        robot = 'torque' if own_plant.drive == 'torque' else 'servo'
-        own, text = own_plant.robot, f'Your plant ({own_plant.name})'
-    else:
-        raise ScriptError(
-            f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
-            f'{type(plant).__name__} {plant!r}'
-        )
-    if isinstance(noise, bool) or not isinstance(noise, int | float | NoiseLaw):
-        raise ScriptError(
-            'noise must be a variance in (rad/s)² or a NoiseLaw: got '
-            f'{type(noise).__name__} {noise!r}'
-        )
-    if isinstance(duration, bool) or not isinstance(duration, int | float):
-        raise ScriptError(f'duration must be a number of seconds: got {duration!r}')
+    robot, own, text = _robot_of(plant)
+    _check_kinds(noise, duration)
     law = noise if isinstance(noise, NoiseLaw) else None
     variance = noise.variance if isinstance(noise, NoiseLaw) else float(noise)
     if own_plant is not None:
@@ -487,18 +468,7 @@ def own_scenario(
     links = faults if isinstance(faults, LinkFaults) else None
     events: Sequence[FaultEvent] = ()
     if faults is not None and links is None:
-        if robot != 'twin':
-            raise ScriptError(
-                'faults must be LinkFaults on a robot other than the twin: got '
-                f'{type(faults).__name__}'
-            )
-        schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
-        events = schedule.events
-        if events and all(event.at >= duration for event in events):
-            raise ScriptError(
-                f'faults must begin within the run, which lasts {duration:g} s: got '
-                f'{min(event.at for event in events):g} s as the first begin'
-            )
+        events = _fault_events(faults, robot, duration)
     parts = OwnParts(
         reference=course,
         links=links,
@@ -513,3 +483,47 @@ def own_scenario(
     found = Scenario(robot, case, seed, duration, variance, gyro, parts)
     found.true_robot()  # a wrong parameter of the robot is an error before the runs
     return found
+
+
+def _robot_of(plant: Any) -> tuple[str, Robot | None, str]:
+    """Return the robot of a plant by name, as given (None: of the package), and its text."""
+    if isinstance(plant, str):
+        (robot,) = find_names('plant', [plant], ROBOTS)
+        return robot, None, KINDS[robot].text
+    if isinstance(plant, Robot):
+        return 'servo', plant, 'Your robot'
+    if isinstance(plant, OdePlant | StateSpace):
+        robot = 'torque' if plant.drive == 'torque' else 'servo'
+        return robot, plant.robot, f'Your plant ({plant.name})'
+    raise ScriptError(
+        f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
+        f'{type(plant).__name__} {plant!r}'
+    )
+
+
+def _check_kinds(noise: Any, duration: Any) -> None:
+    """Raise ScriptError unless noise is a number or a law, and the duration a number."""
+    if isinstance(noise, bool) or not isinstance(noise, int | float | NoiseLaw):
+        raise ScriptError(
+            'noise must be a variance in (rad/s)² or a NoiseLaw: got '
+            f'{type(noise).__name__} {noise!r}'
+        )
+    if isinstance(duration, bool) or not isinstance(duration, int | float):
+        raise ScriptError(f'duration must be a number of seconds: got {duration!r}')
+
+
+def _fault_events(faults: Any, robot: str, duration: float) -> Sequence[FaultEvent]:
+    """Return the events of a schedule or of its file, or raise ScriptError."""
+    if robot != 'twin':
+        raise ScriptError(
+            'faults must be LinkFaults on a robot other than the twin: got '
+            f'{type(faults).__name__}'
+        )
+    schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
+    events = schedule.events
+    if events and all(event.at >= duration for event in events):
+        raise ScriptError(
+            f'faults must begin within the run, which lasts {duration:g} s: got '
+            f'{min(event.at for event in events):g} s as the first begin'
+        )
+    return events
