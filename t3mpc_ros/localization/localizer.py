@@ -386,16 +386,7 @@ class Localizer:
             return False
         self._odometry, self._stamp_ns = pose, stamp_ns
         if last is not None and has_jumped(last, pose, stamp_ns - last_ns):
-            self._pending.clear()
-            self._readings.clear()
-            self._updated, self._updated_ns = pose, stamp_ns
-            if self._estimate is None:
-                return False
-            frame = frame_kept(self._estimate.odometry_frame, last, pose)
-            self._estimate = self._estimate._replace(
-                stamp_ns=stamp_ns, pose=pose_in(frame, pose), odometry_frame=frame
-            )
-            return True
+            return self._follow_jump(last, pose)
         since = 0.0 if last is None else min((stamp_ns - last_ns) / NANOSECONDS, DISORDER)
         self.silence += since
         if self._tracker.active:
@@ -409,6 +400,26 @@ class Localizer:
             return False
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
         self.filter.predict(self._updated, turned, elapsed)
+        return self._correct(pose, elapsed)
+
+    def _follow_jump(self, last: Pose, pose: Pose) -> bool:
+        """Take a jump of the odometry for one of its frame; return whether there is a pose."""
+        self._pending.clear()
+        self._readings.clear()
+        self._updated, self._updated_ns = pose, self._stamp_ns
+        if self._estimate is None:
+            return False
+        frame = frame_kept(self._estimate.odometry_frame, last, pose)
+        self._estimate = self._estimate._replace(
+            stamp_ns=self._stamp_ns, pose=pose_in(frame, pose), odometry_frame=frame
+        )
+        return True
+
+    def _correct(self, pose: Pose, elapsed: float) -> bool:
+        """Correct the particles and the tracked pose by the readings since the last update.
+
+        Return whether there is a pose.
+        """
         taken, doubtful = self._take_beams(pose), self.doubtful
         of_the_map = {sensor: self._of_the_map(each, pose) for sensor, each in taken.items()}
         known = joined([each for name, each in of_the_map.items() if name not in doubtful])
