@@ -411,9 +411,35 @@ def add_ray(
     Return whether what it met has come, see :func:`has_come`; ``hit`` is below zero for nothing.
     What one reading alone says has not: no other is near, nor is it ``supported`` by the last.
     """
+    cosine, sine = math.cos(direction), math.sin(direction)
+    mark_free_along(grid, now, x, y, cosine, sine, free, half_width)
+    if hit < 0.0:
+        return False
+    count = grid.cells.shape[0]
+    column = int(math.floor((x + hit * cosine - grid.low) / grid.size))
+    row = int(math.floor((y + hit * sine - grid.low) / grid.size))
+    if not (0 <= column < count and 0 <= row < count) or grid.cells[row, column] == KNOWN:
+        return False
+    # Nearer than the sensor measures: only if nothing is known to be there already.
+    if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
+        return False
+    return mark_hit(grid, now, row, column, hit, sensor, supported)
+
+
+@kernel
+def mark_free_along(
+    grid: MapGrid,
+    now: float,
+    x: float,
+    y: float,
+    cosine: float,
+    sine: float,
+    free: float,
+    half_width: float,
+) -> None:
+    """Mark the cells along a ray as free up to ``free`` m, and clear what it passes over."""
     low, size = grid.low, grid.size
     count = grid.cells.shape[0]
-    cosine, sine = math.cos(direction), math.sin(direction)
     step = 0.5 * size
     aside = int(math.ceil(half_width / step))
     for along in range(int(free / step) + 1):
@@ -439,20 +465,24 @@ def add_ray(
                 if grid.cleared[row, column] >= CLEARINGS:
                     grid.cells[row, column] = FREE
                     grid.cleared[row, column] = 0
-    if hit < 0.0:
-        return False
-    column = int(math.floor((x + hit * cosine - low) / size))
-    row = int(math.floor((y + hit * sine - low) / size))
-    if not (0 <= column < count and 0 <= row < count) or grid.cells[row, column] == KNOWN:
-        return False
-    # Nearer than the sensor measures: only if nothing is known to be there already.
-    if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
-        return False
-    reach = int(NEW_APART / size)
+
+
+@kernel
+def mark_hit(
+    grid: MapGrid,
+    now: float,
+    row: int,
+    column: int,
+    hit: float,
+    sensor: int,
+    supported: bool,
+) -> bool:
+    """Mark the cell at the end of a ray as occupied; return whether what is there has come."""
+    reach = int(NEW_APART / grid.size)
     new = has_come(grid, now - NEW_FOR, row, column, reach)
     come = new and (supported or has_obstacle(grid.cells, row, column, reach))
     if come and hit < NEW_WITHIN:
-        forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / size))
+        forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / grid.size))
     if grid.cells[row, column] != OCCUPIED:
         grid.author[row, column] = sensor
         if new and grid.seen[row, column] < now - NEW_FOR:
