@@ -60,7 +60,8 @@ from t3mpc_ros.evaluation.method_table import (
 from t3mpc_ros.evaluation.result_output import replace_section
 from t3mpc_ros.evaluation.run_record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
+from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_schedule import FaultEvent
@@ -69,8 +70,8 @@ DURATION, BEGIN, NAMED = 30.0, 15.0, 5.0
 """Length of a run, begin of what does not last for the whole run, and time to name it, s."""
 MARGIN = 1.15
 """Largest ratio to the errors of the best simple method."""
-DEAD_TIME = DigitalTwinParameters().drive.dead_time
-"""Dead time of the exact robot, s."""
+ROBOT = DigitalTwinParameters()  # the exact robot
+DEAD_TIME = ROBOT.drive.dead_time
 SIMPLE = FEED_FORWARD, SHAPED_IN_TIME, LMS
 EXACT = NMPC + EXACT_MODEL
 WHEELS, BODY = ('settled', 'overall'), ('yaw_rate_settled', 'yaw_rate')
@@ -137,6 +138,20 @@ def of_the_world(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
     """Return the velocity along the x axis of the world for that along the robot's."""
     linear, angular = odometry.twist
     return {'twist': BodyTwist(linear * math.cos(odometry.pose.yaw), angular)}
+
+
+def right_wheel_faster(twist: BodyTwist) -> BodyTwist:
+    """Return the twist by wheels of which the right one has a radius that is 5 % too large."""
+    right, left = wheels_from_twist(twist, ROBOT.geometry)
+    return twist_from_wheels(WheelSpeeds(1.05 * right, left), ROBOT.geometry)
+
+
+@with_odometry
+def repeated_twist(link: Any, k: int, odometry: State) -> Mapping[str, Any]:
+    """Return a twist that stays the same for the first 0.1 s of each second."""
+    if k % RATE >= 0.1 * RATE or link.kept is None:
+        link.kept = odometry.twist
+    return {'twist': link.kept}
 
 
 def held(name: str, count: int) -> Send:
@@ -254,6 +269,11 @@ FAULTS: Mapping[str, Fault] = {
     'linear velocity of the odometry + 10 %': Fault(
         send=with_twist(lambda twist: BodyTwist(1.1 * twist.linear, twist.angular))
     ),
+    'yaw rate of the odometry + 20 %': Fault(
+        send=with_twist(lambda twist: BodyTwist(twist.linear, 1.2 * twist.angular))
+    ),
+    'right wheel of the twist + 5 %': Fault(send=with_twist(right_wheel_faster)),
+    'twist of the odometry repeated for 0.1 s each second': Fault(send=repeated_twist),
     'no yaw rate in the odometry': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, 0.0))
     ),

@@ -34,7 +34,7 @@ from t3mpc_ros.control.control_law import (
     fitting_gain,
     servo_gain,
 )
-from t3mpc_ros.control.dead_time_estimator import USED_EVIDENCE, DeadTimeEstimator
+from t3mpc_ros.control.dead_time_estimator import UNKNOWN, USED_EVIDENCE, DeadTimeEstimator
 from t3mpc_ros.control.input_shaper import EARLY, HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
@@ -96,6 +96,7 @@ MIN_DEAD_TIME_CHANGE = 0.0005  # smallest change (s) of the dead time in use
 LINEAR_EVIDENCE = 2.0, 4.0
 """Likelihood ratio, 2 log, of the mean speed alone from which the dead time is not changed against
 it: where the pose leaves open that the yaw rate is late, and where it does not."""
+POSE_EVIDENCE = 0.0  # the same by the pose: while the factor of a wheel is wrong it is 0 to 8
 
 NO_DEAD_TIME = 0.001
 """Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
@@ -927,7 +928,8 @@ class Controller:
         estimator, actuation = self.dead_time, self.actuation
         dead_time, self.disturbed = self.parameters.speed_filter.dead_time, False
         if self.parameters.estimate_dead_time:
-            self.disturbed = estimator.step(speeds, actuation.command, elapsed)
+            by_pose = self._speeds_by_pose()
+            self.disturbed = estimator.step(speeds, actuation.command, elapsed, by_pose)
             dead_time = estimator.dead_time_in_use - self._excess_lag
             if self._is_too_fast_for_lag():
                 self._excess_lag = self.parameters.speed_filter.lag - 0.5 * self._period
@@ -947,16 +949,24 @@ class Controller:
         longer = dead_time - self._dead_time
         if longer > MIN_DEAD_TIME_CHANGE and self.odometry_twist.may_be_late(longer):
             return  # comparisons with the pose decide that first
-        if abs(longer) > MIN_DEAD_TIME_CHANGE and not self._is_by_turns_alone(dead_time):
+        if abs(longer) > MIN_DEAD_TIME_CHANGE and not self._is_contradicted(dead_time):
             self._set_dead_time(dead_time)
 
-    def _is_by_turns_alone(self, dead_time: float) -> bool:
-        """Whether the mean speed contradicts an estimated dead time (s): turns may be late."""
+    def _speeds_by_pose(self) -> Array:
+        """Return the wheel speeds (rad/s) by a prompt pose beside the twist, else NaN."""
+        twist = self.odometry_twist
+        if twist.replaced or not twist.pose_is_prompt:
+            return UNKNOWN
+        return np.array(wheels_from_twist(twist.speeds_by_pose, self.parameters.geometry))
+
+    def _is_contradicted(self, dead_time: float) -> bool:
+        """Whether mean speed or pose contradict an estimated dead time (s): the twist is wrong."""
         if not self.parameters.estimate_dead_time:
             return False
         open_to_doubt = self.odometry_twist.may_turn_late(dead_time - self._dead_time)
         found, in_use = (each + self._excess_lag for each in (dead_time, self._dead_time))
-        return self.dead_time.linear_evidence(found, in_use) > LINEAR_EVIDENCE[not open_to_doubt]
+        linear, by_pose = self.dead_time.contradictions(found, in_use)
+        return linear > LINEAR_EVIDENCE[not open_to_doubt] or by_pose > POSE_EVIDENCE
 
     def _set_dead_time(self, dead_time: float) -> None:
         """Use a dead time (s); below 0 the robot responds before its lag has passed."""

@@ -123,12 +123,20 @@ LOUD = 2.0
 """Factor of the variance of the innovation above which noise, by the change of the error from one
 measurement to the next, is larger than assumed: a wrong dead time or load changes it slowly."""
 
+UNKNOWN = np.full(2, math.nan)  # speeds that nothing measures
+
+NOISY_POSE = 4.0
+"""Variance of the innovation by the pose, over the noise variance, from which it says nothing, as
+that of a pose which is rounded."""
+
 EVIDENCE = np.dtype(
     (
         np.record,
         [
             ('costs', 'f8', GRID_SIZE),  # of each dead time of the grid: errors² / their variance
             ('linear', 'f8', GRID_SIZE),  # the same of the mean of both wheels
+            ('by_pose', 'f8', GRID_SIZE),  # the same of both wheels, by the pose
+            ('poses', 'f8'),  # number of speeds by the pose
             ('duration', 'f8'),  # s
             ('count', 'f8'),  # number of speeds
             ('information', 'f8'),  # Fisher information, 1/s²
@@ -158,6 +166,8 @@ ESTIMATE = np.dtype(
             ('response', 'f8', 2),  # filtered command, rad/s
             ('offset', 'f8', (2, GRID_SIZE)),  # of wheel and dead time of the grid, rad/s
             ('error', 'f8', (2, GRID_SIZE)),  # rad/s
+            ('pose_offset', 'f8', (2, GRID_SIZE)),  # the same of the speeds by the pose
+            ('pose_error', 'f8', (2, GRID_SIZE)),
             ('filtered', 'f8', 2),  # measured speeds behind the lag, rad/s
             ('mean_sign', 'f8', 2),  # mean of tanh(filtered / FRICTION_WIDTH)
             ('friction', 'f8', (2, 2, GRID_SIZE)),  # share of the wheel j in the error of i, rad/s
@@ -228,9 +238,9 @@ class DeadTimeEstimator:
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
         self._update, self._evidence = TypedKernel(update_dead_time), TypedKernel(evidence_against)
-        self._linear = TypedKernel(linear_evidence)
+        self._contradictions = TypedKernel(contradictions)
         self.evidence_against(prior)  # compiles it, which no step has to
-        self._linear(self._state, prior, prior)
+        self._contradictions(self._state, prior, prior)
         self.reset(np.zeros(2))
 
     @property
@@ -266,14 +276,14 @@ class DeadTimeEstimator:
         """
         return self._evidence(self._state, dead_time)
 
-    def linear_evidence(self, dead_time: float, other: float) -> float:
-        """Return 2 log of the likelihood ratio of another dead time and one, s, by the mean speed.
+    def contradictions(self, dead_time: float, other: float) -> tuple[float, float]:
+        """Return 2 log of the likelihood ratio of another dead time and one, s, by two signals.
 
-        Both are without :attr:`lateness`. Where this contradicts what both wheels say, the yaw
-        rate is late, or has another scale.
+        They are the mean speed and the pose; the times are without :attr:`lateness`. Where these
+        contradict what both wheels say, the yaw rate is late, or the twist is wrong otherwise.
         """
         late = self.lateness
-        return self._linear(self._state, dead_time + late, other + late)
+        return self._contradictions(self._state, dead_time + late, other + late)
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
@@ -281,7 +291,8 @@ class DeadTimeEstimator:
         Data that is not accepted yet is discarded, and a disturbance has ended.
         """
         for name in (
-            *('offset', 'error', 'last_error', 'window', 'block', 'pending'),
+            *('offset', 'error', 'pose_offset', 'pose_error', 'last_error'),
+            *('window', 'block', 'pending'),
             *('rate', 'disturbed', 'quiet_time', 'block_disturbed'),
         ):
             self._state[name] = 0
@@ -291,32 +302,41 @@ class DeadTimeEstimator:
         estimate.response = estimate.filtered = speeds
         estimate.mean_sign = np.tanh(speeds / FRICTION_WIDTH)
 
-    def step(self, measured: Array, command: Array, dt: float) -> bool:
+    def step(self, measured: Array, command: Array, dt: float, by_pose: Array = UNKNOWN) -> bool:
         """Update the estimate with one measurement; return whether the response is disturbed.
 
         ``command`` was sent at the previous step, ``dt`` s ago, after the limits, and the robot
-        keeps
-        it; ``measured`` is NaN where there is no measurement. After a gap that stops the robot,
-        call
-        :meth:`reset` instead.
+        keeps it; ``measured`` is NaN where there is no measurement. ``by_pose``, for
+        :meth:`contradictions`, are the same speeds by the change of the pose, NaN where it says
+        nothing. After a gap that stops the robot, call :meth:`reset` instead.
         """
+        speeds = contiguous(measured), contiguous(by_pose)
         return self._update(
-            self._state, self._history, self._drive, contiguous(measured), contiguous(command), dt
+            self._state, self._history, self._drive, *speeds, contiguous(command), dt
         )
 
 
 @kernel
 def update_dead_time(
-    state: Any, history: ResponseHistory, drive: Drive, measured: Array, command: Array, dt: float
+    state: Any,
+    history: ResponseHistory,
+    drive: Drive,
+    measured: Array,
+    by_pose: Array,
+    command: Array,
+    dt: float,
 ) -> bool:
     """Do :meth:`DeadTimeEstimator.step`; ``state`` has the type ESTIMATE and shape (1,)."""
     estimate = state[0]
     follow_command(estimate, history, drive, command, dt)
     if math.isnan(measured[0]):
         return bool(estimate.disturbed)
-    measure_errors(estimate, history, measured, dt)
+    measure_errors(estimate.error, estimate.offset, history, measured, dt)
+    has_pose = not math.isnan(by_pose[0])
+    if has_pose:
+        measure_errors(estimate.pose_error, estimate.pose_offset, history, by_pose, dt)
     spread = remove_friction(estimate, drive, measured, dt) if drive.friction else 0.0
-    add_evidence(estimate, drive.noise_variance + spread, dt)
+    add_evidence(estimate, drive.noise_variance + spread, dt, has_pose)
     detect_disturbance(estimate, dt)
     block = estimate.block
     duration = block.duration + 0.5 * drive.period
@@ -341,11 +361,16 @@ def evidence_against(state: Any, dead_time: float) -> float:
 
 
 @kernel
-def linear_evidence(state: Any, dead_time: float, other: float) -> float:
-    """Do :meth:`DeadTimeEstimator.linear_evidence`; ``state`` as of :func:`update_dead_time`."""
+def contradictions(state: Any, dead_time: float, other: float) -> tuple[float, float]:
+    """Do :meth:`DeadTimeEstimator.contradictions`; ``state`` as of :func:`update_dead_time`."""
     accepted = state[0].accepted
-    apart = cost_at(accepted.linear, dead_time) - cost_at(accepted.linear, other)
-    return float(apart / state[0].noise_ratio)
+    linear = cost_at(accepted.linear, dead_time) - cost_at(accepted.linear, other)
+    by_pose = cost_at(accepted.by_pose, dead_time) - cost_at(accepted.by_pose, other)
+    _, least, _ = minimum(accepted.by_pose)
+    noise_ratio = max(least / max(accepted.poses, 1.0), 1.0)
+    if noise_ratio > NOISY_POSE:
+        by_pose = 0.0
+    return float(linear / state[0].noise_ratio), float(by_pose / noise_ratio)
 
 
 @kernel
@@ -370,13 +395,14 @@ def follow_command(
 
 
 @kernel
-def measure_errors(estimate: Any, history: ResponseHistory, measured: Array, dt: float) -> None:
+def measure_errors(
+    errors: Array, offsets: Array, history: ResponseHistory, measured: Array, dt: float
+) -> None:
     """Set the error of each dead time of the grid.
 
     Each has its own offset, so that a constant load counts as no delay.
     """
     age, undelayed = history
-    errors, offsets = estimate.error, estimate.offset
     j = 0
     share = min(1.0, dt / OFFSET_TIME)
     for g in range(GRID_SIZE):
@@ -429,7 +455,7 @@ def remove_friction(estimate: Any, drive: Drive, measured: Array, dt: float) -> 
 
 
 @kernel
-def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
+def add_evidence(estimate: Any, noise_variance: float, dt: float, has_pose: bool) -> None:
     """Add the errors, divided by their variance ((rad/s)²), to the window and the block.
 
     After an acceleration the drive oscillates: the rate is held.
@@ -470,6 +496,10 @@ def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
         in_block[g] += cost
         mean = 0.5 * (errors[0, g] + errors[1, g])
         estimate.block.linear[g] += min(2.0 * mean**2 / variance, clip)
+        if has_pose:
+            for i in range(2):
+                estimate.block.by_pose[g] += min(estimate.pose_error[i, g] ** 2 / variance, clip)
+    estimate.block.poses += 2.0 * has_pose
     for data in (estimate.window, estimate.block):
         data.duration += dt
         data.count += 2.0
@@ -598,6 +628,8 @@ def reject_block(estimate: Any, driving: bool) -> None:
         for g in range(GRID_SIZE):
             rejected.costs[g] += block.costs[g]
             rejected.linear[g] += block.linear[g]
+            rejected.by_pose[g] += block.by_pose[g]
+        rejected.poses += block.poses
     other, least, _ = minimum(rejected.costs)
     returns = abs(other - estimate.configured) < RETURN_DIFFERENCE
     if rejected.duration < (RETURN_TIME if returns else CHANGE_TIME):
@@ -621,6 +653,8 @@ def scale(data: Any, factor: float) -> None:
     for g in range(GRID_SIZE):
         data.costs[g] *= factor
         data.linear[g] *= factor
+        data.by_pose[g] *= factor
+    data.poses *= factor
     data.duration *= factor
     data.count *= factor
     data.information *= factor
@@ -633,6 +667,8 @@ def add(data: Any, other: Any) -> None:
     for g in range(GRID_SIZE):
         data.costs[g] += other.costs[g]
         data.linear[g] += other.linear[g]
+        data.by_pose[g] += other.by_pose[g]
+    data.poses += other.poses
     data.duration += other.duration
     data.count += other.count
     data.information += other.information
@@ -643,7 +679,8 @@ def add(data: Any, other: Any) -> None:
 def clear(data: Any) -> None:
     """Set all sums to zero, even those that are not finite."""
     for g in range(GRID_SIZE):
-        data.costs[g] = data.linear[g] = 0.0
+        data.costs[g] = data.linear[g] = data.by_pose[g] = 0.0
+    data.poses = 0.0
     data.duration = data.count = data.information = data.nis = 0.0
 
 

@@ -459,6 +459,33 @@ def test_the_mean_speed_tells_late_turns_from_a_dead_time(seed):
     for measured in (late, turns_late):
         estimator, _ = run(Drive(command, measured))
         assert estimator.dead_time > 0.02  # by both wheels
-        evidence.append(estimator.linear_evidence(estimator.dead_time, 0.01))
+        evidence.append(estimator.contradictions(estimator.dead_time, 0.01)[0])
     assert evidence[0] < 0.0
     assert evidence[1] > 4.0
+
+
+@pytest.mark.parametrize(('noise', 'least'), [(0.2, 9.0), (1.0, 0.0)])
+def test_the_pose_tells_a_wrong_twist_from_a_dead_time(noise, least):
+    """A twist that was repeated for 0.1 s each second was a dead time: four times the error."""
+    command = smooth_commands(6.0, 3)
+    prompt, late, repeated = (simulate(command, each, 3).measured for each in (0.01, 0.04, 0.01))
+    for k in range(1, len(repeated)):
+        if 0 < k % 30 <= 20:
+            repeated[k] = repeated[k - 1]
+    parameters = SpeedFilterParameters(lag=LAG, dead_time=0.01, noise_variance=NOISE_VARIANCE)
+    noises = noise * np.random.default_rng(5).normal(size=prompt.shape)
+    evidence = []
+    for measured, pose in ((late, late + noises), (repeated, prompt + noises)):
+        estimator = DeadTimeEstimator(parameters, PERIOD)
+        for k in range(1, len(command)):
+            estimator.step(measured[k], command[k - 1], PERIOD, pose[k])
+        assert estimator.dead_time > 0.03  # by the twist
+        evidence.append(estimator.contradictions(estimator.dead_time, 0.01)[1])
+    assert evidence[0] <= -least
+    assert evidence[1] >= least
+
+
+def test_without_a_pose_nothing_contradicts():
+    command = smooth_commands(2.0, 1)
+    estimator, _ = run(simulate(command, 0.04, 1))
+    assert estimator.contradictions(0.04, 0.01)[1] == 0.0
