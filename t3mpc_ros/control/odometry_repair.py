@@ -426,14 +426,7 @@ class TwistFit:
             return
         ahead, left, turn = motion
         given = [ahead / elapsed, turn / elapsed, *(held or new.twist), left / elapsed]
-        apart, turned = abs(given[0] - given[2]), abs(given[1] - given[3])
-        if (
-            elapsed > FIT_GAP * (self._interval or elapsed)
-            or apart > FAR_BEYOND[0]
-            or turned > FAR_BEYOND[1]
-            or apart * elapsed > JUMP[0]
-            or turned * elapsed > JUMP[1]
-        ):  # A pose that was set, or messages are missing.
+        if self._is_gap(given, elapsed):
             self.interrupt()
             return
         if not self._stages:
@@ -441,14 +434,7 @@ class TwistFit:
             self._time = 0.0
             self._begin_row()
             return
-        share = -math.expm1(-elapsed / FIT_FILTER)
-        for stages, each in zip(self._stages, given, strict=True):
-            first, second, sum_first, sum_second = stages
-            first += share * (each - first)
-            second += share * (first - second)
-            # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
-            stages[:] = first, second, sum_first + elapsed * first, sum_second + elapsed * second
-        self._history.append((self._stages[2][1], self._stages[3][1]))
+        self._filter(given, elapsed)
         changes = zip(self._rough, given, self._last, strict=False)
         self._rough[:] = [each + 0.5 * (now - before) ** 2 for each, now, before in changes]
         self._held.update(self._last, given)
@@ -462,6 +448,28 @@ class TwistFit:
         if self._time > FIT_SETTLING:
             self._add_row()
         self._begin_row()
+
+    def _is_gap(self, given: list[float], elapsed: float) -> bool:
+        """Whether a pose was set or messages are missing, by velocities of pose and twist."""
+        apart, turned = abs(given[0] - given[2]), abs(given[1] - given[3])
+        return (
+            elapsed > FIT_GAP * (self._interval or elapsed)
+            or apart > FAR_BEYOND[0]
+            or turned > FAR_BEYOND[1]
+            or apart * elapsed > JUMP[0]
+            or turned * elapsed > JUMP[1]
+        )
+
+    def _filter(self, given: list[float], elapsed: float) -> None:
+        """Pass the velocities through both stages of the filter."""
+        share = -math.expm1(-elapsed / FIT_FILTER)
+        for stages, each in zip(self._stages, given, strict=True):
+            first, second, sum_first, sum_second = stages
+            first += share * (each - first)
+            second += share * (first - second)
+            # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
+            stages[:] = first, second, sum_first + elapsed * first, sum_second + elapsed * second
+        self._history.append((self._stages[2][1], self._stages[3][1]))
 
     def _begin_row(self) -> None:
         self._since, self._count = 0.0, 0
