@@ -543,24 +543,36 @@ class TwistFit:
 
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
-        linear, angular = self._fits
         if self.pose_lateness:
             return '', 1.0
-        factor, lag, offset = linear.values
-        turns, (least, most) = angular.values[0], ANGULAR_FACTORS
-        way = max(linear.motion, FIT_MOTION[0] ** 2)
-        scaled = abs(factor - 1.0) > TWIST_TOLERANCE and linear.is_certain(0, TWIST_CERTAIN)
-        shifted = abs(offset) > OFFSET_TOLERANCE and linear.is_certain(2, TWIST_CERTAIN)
+        late, turns_late = self._find_late()
+        wrong, common = self._find_linear(late=late)
+        wrong = wrong or self._find_angular(late=turns_late)
+        if wrong and any(self.uses_pose):
+            return wrong, 1.0
+        return '', common
+
+    def _find_late(self) -> list[bool]:
+        """Return whether each velocity is late, as at the comparison before."""
         behind = [
             fit.values[1] > max(LATE, LATE_PERIODS * self._interval)
             and fit.is_certain(1, LATE_CERTAIN)
             for fit in self._fits
         ]
         # Twice: of many decisions one may be wrong.
-        late, turns_late = map(all, zip(behind, self._late, strict=True))
+        late = [each and before for each, before in zip(behind, self._late, strict=True)]
         self._late = behind
+        return late
+
+    def _find_linear(self, *, late: bool) -> tuple[str, float]:
+        """Return what is wrong with the linear velocity, or the factor it has in common."""
+        linear, interval = self._fits[0], self._interval
+        factor, lag, offset = linear.values
+        way = max(linear.motion, FIT_MOTION[0] ** 2)
+        scaled = abs(factor - 1.0) > TWIST_TOLERANCE and linear.is_certain(0, TWIST_CERTAIN)
+        shifted = abs(offset) > OFFSET_TOLERANCE and linear.is_certain(2, TWIST_CERTAIN)
         follows = linear.unexplained < UNLIKE[0] ** 2 * way and linear.roughness < ROUGH**2 * way
-        wrong, common, interval = '', 1.0, self._interval
+        wrong, common = '', 1.0
         if self._held.is_late(interval):
             mean = self._held.late(interval)
             held = 2.0 * mean + interval
@@ -580,13 +592,17 @@ class TwistFit:
             common = factor
         elif scaled:
             wrong = f'its linear velocity is {factor:.3f} times'
-        if not wrong and turns_late:
-            wrong = f'its angular velocity is {angular.values[1]:.3f} s behind'
-        if not wrong and not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
-            wrong = f'its angular velocity is {turns:.3f} times'
-        if wrong and any(self.uses_pose):
-            return wrong, 1.0
-        return '', common
+        return wrong, common
+
+    def _find_angular(self, *, late: bool) -> str:
+        """Return what is wrong with the angular velocity; '' if nothing is."""
+        angular, (least, most) = self._fits[1], ANGULAR_FACTORS
+        turns = angular.values[0]
+        if late:
+            return f'its angular velocity is {angular.values[1]:.3f} s behind'
+        if not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
+            return f'its angular velocity is {turns:.3f} times'
+        return ''
 
     def _is_common(self, factor: float) -> bool:
         """Whether the angular velocity has the factor of the linear one, as far as is known."""
