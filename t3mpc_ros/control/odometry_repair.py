@@ -852,44 +852,59 @@ class OdometryTwist:
         """Return an odometry with its twist; a ``restart`` follows no message before it."""
         if not odometry.is_finite():
             return odometry
-        pose, last, self._last = odometry.pose, self._last, odometry
+        last, self._last = self._last, odometry
         if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
             last = None
             self._blanks.interrupt()
-        motion = None if last is None else motion_between(last.pose, pose)
+        motion = None if last is None else motion_between(last.pose, odometry.pose)
         elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
         by_pose = self._by_pose.update(odometry, elapsed, motion)
         if (self._blanks.has(odometry) or self._blanks.known) and last is not None:
             odometry = odometry._replace(twist=BodyTwist(*by_pose))
         if odometry.twist != (0.0, 0.0):
-            self.missing, self._anchor, self.known = False, None, True
-            moves = any(
-                abs(v) > least for v, least in zip(odometry.twist, FIT_MOTION, strict=True)
-            )
-            self._fit.driven += moves * (elapsed or 0.0)
-            if last is not None and motion is not None:
-                self._units.update(last, odometry, motion)
+            self._add_twist(last, odometry, motion)
         else:
-            if last is None or elapsed is None or self._anchor is None:
-                self._anchor = pose
-            else:
-                farthest = (2.0 * elapsed * speed for speed in UNKNOWN_TWIST)
-                if has_moved(last.pose, pose, *farthest):  # it cannot have driven so far
-                    # That of the next message: this one may be the only one so far off.
-                    self._anchor = None
-            if self._anchor is not None and not self.pose_is_late:
-                self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
+            self._add_zero(last, odometry)
         if last is None or motion is None or self.missing or self._units.wrong:
             self._fit.interrupt()
         elif self.known:
             self._fit.update(odometry, motion)
+        return self._repaired(odometry, None if last is None else by_pose)
+
+    def _add_twist(
+        self, last: State | None, new: State, motion: tuple[float, float, float] | None
+    ) -> None:
+        """Note that the odometry has a twist, and for how long it moves; check its units."""
+        self.missing, self._anchor, self.known = False, None, True
+        if last is None or motion is None:
+            return
+        elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        moves = any(abs(v) > least for v, least in zip(new.twist, FIT_MOTION, strict=True))
+        self._fit.driven += moves * elapsed
+        self._units.update(last, new, motion)
+
+    def _add_zero(self, last: State | None, new: State) -> None:
+        """Decide by the motion of the pose with a twist of zero whether the twist is missing."""
+        if last is None or self._anchor is None:
+            self._anchor = new.pose
+        else:
+            elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+            farthest = (2.0 * elapsed * speed for speed in UNKNOWN_TWIST)
+            if has_moved(last.pose, new.pose, *farthest):  # it cannot have driven so far
+                # That of the next message: this one may be the only one so far off.
+                self._anchor = None
+        if self._anchor is not None and not self.pose_is_late:
+            self.missing = self.missing or has_moved(self._anchor, new.pose, MOVED, TURNED)
+
+    def _repaired(self, odometry: State, by_pose: BodyTwist | None) -> State:
+        """Return an odometry with the twist to use; ``by_pose``: None after a restart."""
         if not self.replaced:
             return odometry
         replaces = [self.missing or self._units.wrong] * 2
         if not any(replaces) and self._fit.wrong:
             replaces = self._fit.uses_pose
         if any(replaces):
-            if last is None:  # the pose says nothing of the speed: a restart
+            if by_pose is None:  # the pose says nothing of the speed: a restart
                 return odometry._replace(twist=STANDSTILL)
             used = zip(replaces, by_pose, odometry.twist, strict=True)
             return odometry._replace(
