@@ -531,51 +531,23 @@ class Controller:
             robot. One that comes before 0.6 of a period has passed changes nothing either: the
             odometry is faster than ``rate``. A message that is not finite stops the robot.
         """
-        stamp = odometry.stamp_ns
-        self.odometry_used = not self._watchdog.ignores(stamp)
+        self.odometry_used = not self._watchdog.ignores(odometry.stamp_ns)
         if not self.odometry_used:
-            if not self._watchdog.enabled:
-                self._stop()
-                self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
-            return self.actuation.twist, self.status
-        stamped, stamp = stamp, self.stamp_filter.time(odometry)
+            return self._ignore(odometry.stamp_ns)
+        stamped, stamp = odometry.stamp_ns, self.stamp_filter.time(odometry)
         odometry = odometry._replace(stamp_ns=stamp)
         last, step_ns = self._last_stamp_ns, self._step_ns
         if last is not None and last < stamp < step_ns + EARLY * self._period_ns:
             return self._wait(odometry)
-        restarted = last is not None and stamp < last
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamped)
-        twist = self.odometry_twist
-        odometry = twist.measured(odometry, restart=elapsed is None)
-        believed, self._twist_believed = self._twist_believed, not twist.replaced
-        disbelieved = believed and twist.replaced and not (twist.missing and twist.known)
+        odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
+        disbelieved = self._disbelieve_twist()
         if disbelieved:
             elapsed = None  # the speeds before were no measurements: all estimates begin again
-            self.dead_time = self._make_dead_time_estimator()
-            self.wheel_monitor.reset()
-        if restarted:
-            self._clear_reference()
-            if self.keep_out is not None:
-                self.keep_out.reset()
-        elif (
-            self.keep_out is not None
-            and last is not None
-            and odometry.is_finite()
-            and has_moved(self._place, odometry.pose, *POSE_JUMP)
-        ):  # a localisation has found the robot elsewhere
-            self.keep_out.relocate()  # what it has marked was marked at another place
-            self.drive_monitor.contact_monitor.restart(None)
-        plan_ns, reason = self._sample_plan(odometry)
-        if elapsed is None or not reason.moves:
-            self.drive_monitor.begin()
-        if reason.moves:
-            reason = self.drive_monitor.decide(
-                odometry, self.actuation.twist, elapsed or 0.0, following=self._response.responsive
-            )
+        self._check_continuity(last, odometry)
+        plan_ns, reason = self._decide(odometry, elapsed)
         speeds, reference, begin, end = self._sampled
-        if self.keep_out is not None and odometry.is_finite():
-            reason = self._check_keep_out(odometry, reason, begin)
         if not reason.moves:
             self._stop()
             self.status = self._make_status(stamp, reason, speeds - reference)
@@ -594,24 +566,18 @@ class Controller:
         # A robot that drives on where only its speeds are known anew: the plan is kept.
         followed = self._response.responsive
         follows = disbelieved and self._moving and followed
-        if not restart:
-            self.wheel_monitor.update(stamp, speeds.tolist(), actuation.command.tolist())
         if restart:
             self.wheel_monitor.interrupt()
             actuation.reset(speeds, follows=follows)
             self._reset_response()
             self._snapshots.clear()
-        elif not self._is_responsive(speeds):
-            by_pose = self._twist_believed and self._pose_response.responsive
-            if not (followed and by_pose and twist.pose_is_prompt):
-                return self._command_unresponsive(odometry, dt)
-            twist.reject()  # from the next message on
-            self._reset_response()
-            self._add_command()
-            return actuation.twist, self.status
-        elif self.status.reason is Reason.NOT_FOLLOWING:
-            restart = True
-            actuation.reset(speeds, actuation.command.copy())
+        else:
+            self.wheel_monitor.update(stamp, speeds.tolist(), actuation.command.tolist())
+            if not self._is_responsive(speeds):
+                return self._follow_unresponsive(odometry, dt, followed=followed)
+            if self.status.reason is Reason.NOT_FOLLOWING:
+                restart = True
+                actuation.reset(speeds, actuation.command.copy())
         self._observe(speeds, dt, restart=restart)
         if self.parameters.pose.enabled:
             if restart:
@@ -620,12 +586,7 @@ class Controller:
         if restart and not follows:
             self._begin_plan(stamp, plan_ns)
         applied = self._send(stamp, plan_ns, odometry.pose.yaw, dt)
-        short = self.parameters.composition == 'paper' and self._reach.update(
-            actuation.speeds.tolist(),
-            actuation.command.tolist(),
-            (self._lag * actuation.speed_filter.state.disturbance).tolist(),
-            dt,
-        )
+        short = self._falls_short(dt)
         self.law.set_applied(applied, saturated=actuation.limited or short)
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
@@ -718,6 +679,13 @@ class Controller:
             return Reason.TOO_FEW_RANGES
         return reason
 
+    def _ignore(self, stamp_ns: int) -> tuple[BodyTwist, Status]:
+        """Return the last command at a message that is not used; a disabled robot stops."""
+        if not self._watchdog.enabled:
+            self._stop()
+            self.status = self._make_status(stamp_ns, Reason.DISABLED, self.status.error)
+        return self.actuation.twist, self.status
+
     def _wait(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the last command at an odometry that comes before the period has passed."""
         _, reason = self._sample_plan(odometry)
@@ -726,6 +694,45 @@ class Controller:
         self._stop()
         self.status = self._make_status(odometry.stamp_ns, reason, self.status.error)
         return STANDSTILL, self.status
+
+    def _disbelieve_twist(self) -> bool:
+        """Whether a twist that was used is replaced from now on; the estimates by it end."""
+        twist = self.odometry_twist
+        believed, self._twist_believed = self._twist_believed, not twist.replaced
+        if not (believed and twist.replaced) or (twist.missing and twist.known):
+            return False
+        self.dead_time = self._make_dead_time_estimator()
+        self.wheel_monitor.reset()
+        return True
+
+    def _check_continuity(self, last_ns: int | None, odometry: State) -> None:
+        """Clear what an odometry that does not follow the last one makes invalid."""
+        if last_ns is None:
+            return
+        if odometry.stamp_ns < last_ns:  # the source has restarted
+            self._clear_reference()
+            if self.keep_out is not None:
+                self.keep_out.reset()
+        elif (
+            self.keep_out is not None
+            and odometry.is_finite()
+            and has_moved(self._place, odometry.pose, *POSE_JUMP)
+        ):  # a localisation has found the robot elsewhere
+            self.keep_out.relocate()  # what it has marked was marked at another place
+            self.drive_monitor.contact_monitor.restart(None)
+
+    def _decide(self, odometry: State, elapsed: float | None) -> tuple[int, Reason]:
+        """Sample the plan; return the instant planned for, ns, and whether to move."""
+        plan_ns, reason = self._sample_plan(odometry)
+        if elapsed is None or not reason.moves:
+            self.drive_monitor.begin()
+        if reason.moves:
+            reason = self.drive_monitor.decide(
+                odometry, self.actuation.twist, elapsed or 0.0, following=self._response.responsive
+            )
+        if self.keep_out is not None and odometry.is_finite():
+            reason = self._check_keep_out(odometry, reason, self._sampled.begin)
+        return plan_ns, reason
 
     def _sample_plan(self, odometry: State) -> tuple[int, Reason]:
         """Sample speeds and reference; return the instant planned for, ns, and whether to move."""
@@ -759,6 +766,16 @@ class Controller:
             self._disturbed_for = 0.0
         else:
             self._update_dead_time(speeds, dt)
+
+    def _falls_short(self, elapsed: float) -> bool:
+        """Whether the drive does not reach its commands, where the law acts on the wheels."""
+        actuation = self.actuation
+        return self.parameters.composition == 'paper' and self._reach.update(
+            actuation.speeds.tolist(),
+            actuation.command.tolist(),
+            (self._lag * actuation.speed_filter.state.disturbance).tolist(),
+            elapsed,
+        )
 
     def _begin_plan(self, stamp_ns: int, plan_ns: int) -> None:
         """Begin to move at the predicted speeds, towards the reference at ``plan_ns``."""
@@ -899,6 +916,18 @@ class Controller:
         self._stop()
         self.status = self._make_status(self._last_stamp_ns or 0, Reason.NO_ODOMETRY)
         return True
+
+    def _follow_unresponsive(
+        self, odometry: State, elapsed: float, *, followed: bool
+    ) -> tuple[BodyTwist, Status]:
+        """Return the command where the twist does not follow; the pose may, as ``followed``."""
+        by_pose = self._twist_believed and self._pose_response.responsive
+        if not (followed and by_pose and self.odometry_twist.pose_is_prompt):
+            return self._command_unresponsive(odometry, elapsed)
+        self.odometry_twist.reject()  # from the next message on
+        self._reset_response()
+        self._add_command()
+        return self.actuation.twist, self.status
 
     def _command_unresponsive(self, odometry: State, elapsed: float) -> tuple[BodyTwist, Status]:
         """Command the reference to a robot that does not follow commands; adaptation pauses.
