@@ -957,7 +957,7 @@ class Controller:
         estimator, actuation = self.dead_time, self.actuation
         dead_time, self.disturbed = self.parameters.speed_filter.dead_time, False
         if self.parameters.estimate_dead_time:
-            by_pose = self._speeds_by_pose()
+            by_pose = self._speeds_by_pose(elapsed)
             self.disturbed = estimator.step(speeds, actuation.command, elapsed, by_pose)
             dead_time = estimator.dead_time_in_use - self._excess_lag
             if self._is_too_fast_for_lag():
@@ -981,10 +981,14 @@ class Controller:
         if abs(longer) > MIN_DEAD_TIME_CHANGE and not self._is_contradicted(dead_time):
             self._set_dead_time(dead_time)
 
-    def _speeds_by_pose(self) -> Array:
-        """Return the wheel speeds (rad/s) by a prompt pose beside the twist, else NaN."""
+    def _speeds_by_pose(self, elapsed: float) -> Array:
+        """Return the wheel speeds (rad/s) by a prompt pose beside the twist, else NaN.
+
+        They are means since the last message; those of the twist must be of the same time.
+        """
         twist = self.odometry_twist
-        if twist.replaced or not twist.pose_is_prompt:
+        same_time = self.parameters.mean_speeds and elapsed < 1.5 * self._period
+        if twist.replaced or not (same_time and twist.pose_is_prompt):
             return UNKNOWN
         return np.array(wheels_from_twist(twist.speeds_by_pose, self.parameters.geometry))
 
