@@ -327,12 +327,12 @@ class BodyCorrection:
         time or a gain that is wrong has no such correlation.
         """
         memory = self._memory[0]
-        known = memory.ring_product > RINGING_CORRELATION * math.sqrt(
-            memory.ring_error * memory.ring_acceleration
-        )
-        if not known or memory.ring_count < RINGING_STEPS:
+        if memory.ring_count < RINGING_STEPS:
             return 0.0
-        frequency = math.sqrt(memory.ring_product / memory.ring_error) / (2.0 * math.pi)
+        error, product = memory.ring_error, memory.ring_product
+        if not product > RINGING_CORRELATION * math.sqrt(error * memory.ring_acceleration):
+            return 0.0
+        frequency = math.sqrt(product / error) / (2.0 * math.pi)
         return frequency if frequency * self._period < RINGING_RATE else 0.0
 
     def problem(self) -> str:
