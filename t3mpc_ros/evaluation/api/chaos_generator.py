@@ -146,7 +146,8 @@ def _span(tspan: tuple[float, float]) -> tuple[float, float]:
 
 def _check_steps(dt: float | None, every: int | None, rtol: float, span: float) -> None:
     """Raise ScriptError for a step, a number of steps or a tolerance that is out of range."""
-    if dt is not None and not (isinstance(dt, int | float) and 0.0 < dt <= span):
+    known = isinstance(dt, int | float) and not isinstance(dt, bool)
+    if dt is not None and not (known and 0.0 < dt <= span):
         raise ScriptError(f'dt must be above 0 s and at most the span: got {dt!r}')
     if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
         raise ScriptError(f'every must be a whole number, at least 1: got {every!r}')

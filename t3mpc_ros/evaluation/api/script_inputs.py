@@ -463,6 +463,7 @@ def own_scenario(
             )
     course = None
     if reference is not None:
+        Scenario(robot, NOMINAL, seed, duration)  # a wrong duration is an error before
         geometry = WheelGeometry() if own is None else own.plant_parameters().geometry
         course, text = sampled(reference, duration, geometry), f'{text}, your reference'
     links = faults if isinstance(faults, LinkFaults) else None
@@ -518,6 +519,11 @@ def _fault_events(faults: Any, robot: str, duration: float) -> Sequence[FaultEve
         raise ScriptError(
             'faults must be LinkFaults on a robot other than the twin: got '
             f'{type(faults).__name__}'
+        )
+    if not isinstance(faults, FaultSchedule | str | Path):
+        raise ScriptError(
+            'faults must be LinkFaults, a FaultSchedule, or the name or file of one: got '
+            f'{type(faults).__name__} {faults!r}'
         )
     schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
     events = schedule.events

@@ -185,6 +185,15 @@ WRONG = [
         'faults must begin within the run, which lasts 8 s: got 100 s as the first begin',
     ),
     (
+        lambda: run('full', plant='twin', faults=5, duration=8.0),
+        'faults must be LinkFaults, a FaultSchedule, or the name or file of one: got int 5',
+    ),
+    (
+        lambda: run(reference=lambda time: (1.0, 1.0), duration=-1.0),
+        'duration must be from .* s: got -1.0',
+    ),
+    (lambda: t3.chaos(dt=True), 'dt must be above 0 s and at most the span: got True'),
+    (
         lambda: t3.OdePlant(wrong_states),
         r'wrong_states must return 2 numbers, one for each state: got the shape \(3,\)',
     ),
