@@ -128,6 +128,17 @@ def test_a_twist_that_stops_at_times_is_no_dead_time(monkeypatch):
     assert found['settled'] == pytest.approx(run_job(Job('none', FULL, 2001))['settled'], rel=0.05)
 
 
+def test_a_pose_that_is_late_contradicts_no_dead_time(monkeypatch):
+    """Before it was known to come ten times a second it contradicted the right one for good."""
+    monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
+    wrong = {'speed_filter.dead_time': 0.04}
+    held = dataclasses.replace(FAULTS['pose ten times a second'], assumed=wrong)
+    for name, fault in (('held', held), ('dead time', Fault(assumed=wrong))):
+        monkeypatch.setitem(FAULTS, name, fault)
+    late, prompt = (run_job(Job(name, FULL, 2001))['settled'] for name in ('held', 'dead time'))
+    assert late < 1.1 * prompt
+
+
 @pytest.mark.parametrize('rate', [85.0, 118.0, 62.0, 150.0])
 def test_a_rate_that_is_not_that_of_the_odometry_costs_little(rate, monkeypatch):
     """Steps counted as whole periods: four times the settled error, unnamed below 20 %."""
