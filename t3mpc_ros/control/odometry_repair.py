@@ -522,6 +522,14 @@ class TwistFit:
         return EARLY_STEP * self._shifted.index(least) if known else 0.0
 
     @property
+    def pose_is_behind(self) -> bool:
+        """Whether the pose is later than the twist by less than such a delay."""
+        least = max(LATE, LATE_PERIODS * self._interval)
+        return any(
+            fit.values[1] < -least and fit.is_certain(1, LATE_CERTAIN) for fit in self._fits
+        )
+
+    @property
     def pose_is_scaled(self) -> bool:
         """Whether factors of the twist explain it nearly as well as a late pose.
 
@@ -792,7 +800,7 @@ class OdometryTwist:
     @property
     def pose_is_prompt(self) -> bool:
         """Whether the pose is new in each message, and of its time, as far as is known."""
-        return not (self._by_pose.holds or self.pose_is_late)
+        return not (self._by_pose.holds or self.pose_is_late or self._fit.pose_is_behind)
 
     def may_be_late(self, time: float) -> bool:
         """Whether a twist that is used is more likely late by ``time`` (s) than not at all."""
