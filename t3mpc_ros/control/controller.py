@@ -999,8 +999,8 @@ class Controller:
         open_to_doubt = self.odometry_twist.may_turn_late(dead_time - self._dead_time)
         found, in_use = (each + self._excess_lag for each in (dead_time, self._dead_time))
         linear, by_pose = self.dead_time.contradictions(found, in_use)
-        prompt = self.odometry_twist.pose_is_prompt  # what it said before may have been late
-        return linear > LINEAR_EVIDENCE[not open_to_doubt] or (prompt and by_pose > POSE_EVIDENCE)
+        proven = self.odometry_twist.pose_is_proven
+        return linear > LINEAR_EVIDENCE[not open_to_doubt] or (proven and by_pose > POSE_EVIDENCE)
 
     def _set_dead_time(self, dead_time: float) -> None:
         """Use a dead time (s); below 0 the robot responds before its lag has passed."""

@@ -522,6 +522,11 @@ class TwistFit:
         return EARLY_STEP * self._shifted.index(least) if known else 0.0
 
     @property
+    def is_compared(self) -> bool:
+        """Whether there are enough comparisons for a fit."""
+        return all(fit.rows >= FIT_ROWS for fit in self._fits)
+
+    @property
     def pose_is_behind(self) -> bool:
         """Whether the pose is later than the twist by less than such a delay."""
         least = max(LATE, LATE_PERIODS * self._interval)
@@ -801,6 +806,11 @@ class OdometryTwist:
     def pose_is_prompt(self) -> bool:
         """Whether the pose is new in each message, and of its time, as far as is known."""
         return not (self._by_pose.holds or self.pose_is_late or self._fit.pose_is_behind)
+
+    @property
+    def pose_is_proven(self) -> bool:
+        """Whether enough comparisons with the twist say that the pose is prompt."""
+        return self.pose_is_prompt and self._fit.is_compared
 
     def may_be_late(self, time: float) -> bool:
         """Whether a twist that is used is more likely late by ``time`` (s) than not at all."""
