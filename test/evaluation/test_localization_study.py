@@ -114,6 +114,7 @@ def test_the_table_has_medians_and_counts():
     ]
     lines = markdown(plan, ResultTable(rows)).splitlines()
     assert '2 min in room' in lines[0]
+    assert '| on its path from minute 1 on, % |' in lines[2]  # the second half
     assert '| 10.0 (10.0) | 0.57 (0.57) | 30 (30) |' in lines[-1]
     assert '1 of 2' in lines[-1]
     assert lines[-1].endswith('| 75.0 (50.0) | 3 |')

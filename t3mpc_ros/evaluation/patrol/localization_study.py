@@ -117,7 +117,7 @@ def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
     ``largest`` position error up to then (m); ``lost``, time in which the robot was lost (s);
     ``found``, time from carrying until it was lost no more (s), infinite if it still was at the
     end; ``deceived``, time in which it was off by :data:`LOST_DISTANCE` and took its place for
-    known (s); ``on_path``, share of the time on the path from the third minute on; ``contacts``.
+    known (s); ``on_path``, see :func:`.share_on_path`; ``contacts``.
     """
     apart = record['pose'] - record['truth']
     position = np.hypot(apart[:, 0], apart[:, 1])
@@ -181,7 +181,7 @@ def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
         'lost, s',
         f'found within {FOUND_WITHIN:g} s',
         'wrong and sure, s',
-        'on its path from minute 3 on, %',
+        f'on its path from minute {patrol_run.explored_after(plan.duration) / 60.0:g} on, %',
         'contacts',
     )
     planned = ', planned path' if plan.planned else ''

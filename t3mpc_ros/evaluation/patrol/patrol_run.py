@@ -214,9 +214,14 @@ def path_error(record: Record) -> Array:
 
 
 def share_on_path(record: Record) -> float:
-    """Return the share of the time from the third minute on within 50 mm of the reference."""
-    late = record['time'] >= min(EARLY, 0.5 * float(record['time'][-1]))
+    """Return the share of the time within 50 mm of the reference, see :func:`explored_after`."""
+    late = record['time'] >= explored_after(float(record['time'][-1]))
     return float((path_error(record)[late] < ON_PATH).mean())
+
+
+def explored_after(duration: float) -> float:
+    """Return when the robot has mainly explored, s: at :data:`EARLY`, or half of a short drive."""
+    return min(EARLY, 0.5 * duration)
 
 
 def outside_avoidance(record: Record) -> NDArray[np.bool_]:
