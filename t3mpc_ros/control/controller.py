@@ -650,8 +650,9 @@ class Controller:
         return applied
 
     def _add_command(self) -> None:
-        for monitor in (self._response, self._pose_response):
-            monitor.add_command(*self.actuation.command.tolist())
+        right, left = self.actuation.command.tolist()
+        self._response.add_command(right, left)
+        self._pose_response.add_command(right, left)
 
     def _reset_response(self) -> None:
         """Assume a robot that follows its commands."""
@@ -860,10 +861,11 @@ class Controller:
 
         Its stiffness or its inertia are not those assumed; the other frequency changes alike.
         """
-        found, assumed = self.body.turning_frequency, self._turning_frequency
-        if found == 0.0 or assumed == 0.0 or self._ahead_ns == 0:
+        assumed = self._turning_frequency
+        if assumed == 0.0 or self._ahead_ns == 0:
             return
-        if max(found / assumed, assumed / found) < OTHER_FREQUENCY:
+        found = self.body.turning_frequency
+        if found == 0.0 or max(found / assumed, assumed / found) < OTHER_FREQUENCY:
             return
         self._turning_frequency = found
         configured = self.parameters.command_shaper

@@ -59,6 +59,7 @@ MIN_ROWS = 20  # rows from which the noise is known
 
 SCALES = 0.05, 0.3  # velocities that count as small, m/s and rad/s
 STANDING = 0.05  # measured velocity of a standing robot, in the scales
+MEDIAN_EVERY = 5  # messages between two medians: one of a hundred numbers costs 5 µs
 STANDING_TIME = 0.3
 """Time for which a robot stands against its command before it counts as stopped, s."""
 GAIN_TOLERANCE = 0.03  # deviation of a gain from 1 that is reported, once it is certain
@@ -161,6 +162,7 @@ class Gaps:
     def __init__(self, rate: float) -> None:
         self._intervals: deque[float] = deque(maxlen=max(5, round(rate)))
         self._period = 1.0 / rate
+        self._since_median = 0  # number of intervals
         self._last_ns: int | None = None
         self._recent: deque[tuple[int, float, int]] = deque()
         self.number = 0
@@ -182,8 +184,9 @@ class Gaps:
             self._recent.clear()
             return None
         self._intervals.append(elapsed)
-        if len(self._intervals) % 5 == 0 or elapsed > GAP * self._period:
-            self._period = median(self._intervals)
+        self._since_median += 1
+        if self._since_median >= MEDIAN_EVERY or elapsed > GAP * self._period:
+            self._period, self._since_median = median(self._intervals), 0
         if periods is not None:
             self._add(stamp_ns, elapsed, periods - 1)
         elif len(self._intervals) >= 5:
@@ -249,7 +252,8 @@ class OdometryMonitor:
         self._rate = rate
         self.gaps = Gaps(rate)
         self._offsets: deque[float] = deque(maxlen=max(5, round(rate)))
-        self._typical = 0.0
+        self._typical, self._since_median = 0.0, 0
+        """Median of them, and messages since it was computed."""
         self.late = 0  # messages that took much longer than the others
         self.jumps = 0  # changes of the pose that no motion explains
         self._jumps_ns: deque[int] = deque(maxlen=1000)  # stamps of those in the last 10 s
@@ -279,8 +283,9 @@ class OdometryMonitor:
         offset = (now_ns - odometry.stamp_ns) / NANOSECONDS
         self.late += len(self._offsets) > 5 and offset > self._typical + LATE
         self._offsets.append(offset)
-        if len(self._offsets) % 5 == 0:
-            self._typical = median(self._offsets)
+        self._since_median += 1
+        if self._since_median == MEDIAN_EVERY:
+            self._typical, self._since_median = median(self._offsets), 0
         if not odometry.is_finite():
             self._interrupt()
             return

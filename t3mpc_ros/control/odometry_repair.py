@@ -14,6 +14,7 @@
 """What is wrong with stamps and twist of the odometry, and what is used in their place."""
 
 from collections import deque
+from collections.abc import Sequence
 import math
 from statistics import median
 
@@ -377,6 +378,10 @@ class TwistFit:
         """What is wrong with the twist otherwise; '' if nothing is."""
         self.uses_pose = [False, False]
         """Whether a velocity by the pose is the better one, to be used where something is."""
+        self.pose_lateness = 0.0
+        """Time after which the pose says what the twist has said, s; 0 if that is no better."""
+        self.pose_is_behind = False
+        """Whether the pose is later than the twist by less than such a delay."""
         self._late = [False, False]  # whether the velocities were at the last comparison
         self._fits = [
             VelocityFit(prior, noise) for prior, noise in zip(FIT_PRIOR, FIT_NOISE, strict=True)
@@ -411,21 +416,24 @@ class TwistFit:
         if last is None:
             return
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        way = [each * (elapsed - self._held_for) for each in new.twist]
-        self._held_way = [held + each for held, each in zip(self._held_way, way, strict=True)]
+        if self._held_for or new.pose == last.pose:
+            way = [each * (elapsed - self._held_for) for each in new.twist]
+            self._held_way = [held + each for held, each in zip(self._held_way, way, strict=True)]
         if new.pose == last.pose:  # the robot stands, or a camera holds it for a while
             self._from, self._held_for = last, elapsed
             if elapsed > FIT_SETTLING:
                 self.interrupt()
             return
         # Coarse counters hold it as well: the twist is zero then, and double in other messages.
-        held = [each / elapsed for each in self._held_way] if self._held_for else None
-        self._held_for, self._held_way = 0.0, [0.0, 0.0]
+        twist: Sequence[float] = new.twist
+        if self._held_for:
+            twist = [each / elapsed for each in self._held_way]
+            self._held_for, self._held_way = 0.0, [0.0, 0.0]
         if new.pose.yaw == last.pose.yaw and abs(new.twist.angular) > FIT_MOTION[1]:
             self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
             return
         ahead, left, turn = motion
-        given = [ahead / elapsed, turn / elapsed, *(held or new.twist), left / elapsed]
+        given = [ahead / elapsed, turn / elapsed, *twist, left / elapsed]
         if self._is_gap(given, elapsed):
             self.interrupt()
             return
@@ -435,8 +443,9 @@ class TwistFit:
             self._begin_row()
             return
         self._filter(given, elapsed)
-        changes = zip(self._rough, given, self._last, strict=False)
-        self._rough[:] = [each + 0.5 * (now - before) ** 2 for each, now, before in changes]
+        rough, last_given = self._rough, self._last
+        for i in range(len(rough)):
+            rough[i] += 0.5 * (given[i] - last_given[i]) ** 2
         self._held.update(self._last, given)
         self._last = given
         self._time += elapsed
@@ -448,6 +457,7 @@ class TwistFit:
         if self._time > FIT_SETTLING:
             self._add_row()
         self._begin_row()
+        self.pose_is_behind = self._is_behind()
 
     def _is_gap(self, given: list[float], elapsed: float) -> bool:
         """Whether a pose was set or messages are missing, by velocities of pose and twist."""
@@ -492,6 +502,7 @@ class TwistFit:
         kept = 1.0 - FIT_ROW / FIT_MEMORY
         self._aside = kept * self._aside + means[4][1] ** 2
         self._shift(kept)
+        self.pose_lateness = self._find_pose_lateness()
         self._age += FIT_ROW
         known = self._fits[0].rows >= FIT_ROWS or any(fit.is_reversed for fit in self._fits)
         if known or self._held.is_late(self._interval):
@@ -514,9 +525,7 @@ class TwistFit:
             apart = self._stages[0][1] - linear, STAMP_ARM * (self._stages[1][1] - angular)
             self._shifted[i] = kept * self._shifted[i] + apart[0] ** 2 + apart[1] ** 2
 
-    @property
-    def pose_lateness(self) -> float:
-        """Time after which the pose says what the twist has said, s; 0 if that is no better."""
+    def _find_pose_lateness(self) -> float:
         least = min(self._shifted)
         known = round(self._fits[0].rows) >= EARLY_ROWS and least < EARLY * self._shifted[0]
         return EARLY_STEP * self._shifted.index(least) if known else 0.0
@@ -526,9 +535,7 @@ class TwistFit:
         """Whether there are enough comparisons for a fit."""
         return all(fit.rows >= FIT_ROWS for fit in self._fits)
 
-    @property
-    def pose_is_behind(self) -> bool:
-        """Whether the pose is later than the twist by less than such a delay."""
+    def _is_behind(self) -> bool:
         least = max(LATE, LATE_PERIODS * self._interval)
         return any(
             fit.values[1] < -least and fit.is_certain(1, LATE_CERTAIN) for fit in self._fits
@@ -638,7 +645,7 @@ class TwistUnits:
         """Twist and change of the pose in a message in which they contradict each other."""
         self._counts = [0, 0]
         self._before: list[tuple[float, float] | None] = [None, None]
-        self._sums = [[0.0] * 3 for _ in range(2)]
+        self._sums = [(0.0, 0.0, 0.0)] * 2
         """Of each velocity: number of changes, squared noise of the twist, and of the pose."""
 
     def update(self, last: State, new: State, motion: tuple[float, float, float]) -> None:
@@ -662,11 +669,14 @@ class TwistUnits:
 
     def _is_noisy(self, i: int, given: float, rate: float) -> bool:
         """Whether a velocity of the twist has far more noise than the pose, and than any robot."""
-        sums, before = self._sums[i], self._before[i] or (given, rate)
+        count, of_twist, of_pose = self._sums[i]
+        before = self._before[i] or (given, rate)
         self._before[i] = given, rate
-        each = 1.0, 0.5 * (given - before[0]) ** 2, 0.5 * (rate - before[1]) ** 2
-        sums[:] = (UNITS_MEMORY * old + new for old, new in zip(sums, each, strict=True))
-        return sums[1] > max(UNITS_NOISE[i] ** 2 * sums[0], FAR**2 * sums[2])
+        count = UNITS_MEMORY * count + 1.0
+        of_twist = UNITS_MEMORY * of_twist + 0.5 * (given - before[0]) ** 2
+        of_pose = UNITS_MEMORY * of_pose + 0.5 * (rate - before[1]) ** 2
+        self._sums[i] = count, of_twist, of_pose
+        return of_twist > max(UNITS_NOISE[i] ** 2 * count, FAR**2 * of_pose)
 
 
 HELD_MOST, HELD_MEMORY = 0.25, 0.97
@@ -789,8 +799,9 @@ class OdometryTwist:
     def replaced(self) -> bool:
         """Whether the twist that is used is not the one that was received."""
         fit = self._fit
-        wrong = self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
-        return wrong or self._blanks.known
+        if fit.wrong or fit.factor != 1.0:
+            return True
+        return self.missing or self._units.wrong or self._blanks.known
 
     @property
     def speeds_by_pose(self) -> BodyTwist:

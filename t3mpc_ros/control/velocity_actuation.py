@@ -189,6 +189,7 @@ class VelocityActuation:
         """Last commanded wheel speeds, rad/s, shape (2,); zeros with a torque drive."""
         self._wanted = np.zeros(2)  # the same before the deadband, from which the limits go on
         self._actuation_command = TypedKernel(actuation_command)
+        self._limit_command = TypedKernel(limit_command)
         self.reset(np.zeros(2))
 
     @property
@@ -258,7 +259,7 @@ class VelocityActuation:
             each.step(wanted, elapsed)
             for each, wanted in zip(self._deadbands, self._wanted.tolist(), strict=True)
         )
-        limit_command(right, left, self.command, self._limits, elapsed, self.command)
+        self._limit_command(right, left, self.command, self._limits, elapsed, self.command)
 
     def observe(self, measured: Array, dt: float) -> None:
         """Update the filter with wheel speeds (rad/s) measured ``dt`` s after the last update.
@@ -295,7 +296,7 @@ class VelocityActuation:
         """Command wheel speeds (rad/s), shape (2,), within the limits, without feedback."""
         self._sent = True
         right, left = wheels.tolist()
-        self.limited = limit_command(
+        self.limited = self._limit_command(
             right, left, self._wanted, self._limits, self._period, self._wanted
         )
         self._apply_deadbands(self._period)

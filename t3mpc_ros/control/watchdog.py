@@ -374,22 +374,22 @@ class WheelMonitor:
             self.reset()
         self._now_ns = stamp_ns
         self._samples += 1
-        share = max(1.0 / self._samples, 1.0 / NOISE_STEPS)
+        share, steps = max(1.0 / self._samples, 1.0 / NOISE_STEPS), self._mean_steps
+        times, least, part = WHEEL_OUTSIDE
+        noise, largest = self._noise, self._largest
         for wheel in range(2):
             commands, measured, speed = self._commands[wheel], self._measured[wheel], speeds[wheel]
             commands.append(command[wheel])
             if measured:
                 half_square = 0.5 * (speed - measured[-1]) ** 2
-                self._noise[wheel] += share * (half_square - self._noise[wheel])
+                noise[wheel] += share * (half_square - noise[wheel])
             measured.append(speed)
             if len(commands) < (commands.maxlen or 0):
                 continue
-            mean = sum(measured) / self._mean_steps
-            times, least, part = WHEEL_OUTSIDE
-            bound = times * math.sqrt(self._noise[wheel] / self._mean_steps) + least
-            kept = (1.0 - 1.0 / LARGEST_MEMORY) * self._largest[wheel]
-            self._largest[wheel] = max(abs(mean), kept)
-            if abs(mean - commands[-self._mean_steps]) <= bound:
+            mean = sum(measured) / steps
+            bound = times * math.sqrt(noise[wheel] / steps) + least
+            largest[wheel] = max(abs(mean), (1.0 - 1.0 / LARGEST_MEMORY) * largest[wheel])
+            if abs(mean - commands[-steps]) <= bound:
                 continue
             nearest = min(max(mean, min(commands)), max(commands))
             if abs(mean - nearest) > bound + part * abs(nearest):
@@ -679,11 +679,13 @@ class DriveMonitor:
     def _stands(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
         """Whether the robot has not moved for longer than its commands allow."""
         pose, measured, asked = odometry.pose, self._measured, self._asked
-        for i in range(2):
-            measured[i] += odometry.twist[i] * elapsed
-            asked[i] += command[i] * elapsed
+        twist = odometry.twist
+        measured[0] += twist.linear * elapsed
+        measured[1] += twist.angular * elapsed
+        asked[0] += command.linear * elapsed
+        asked[1] += command.angular * elapsed
         self._since += elapsed
-        moved = any(abs(one) > bound for one, bound in zip(measured, MOTION, strict=True))
+        moved = abs(measured[0]) > MOTION[0] or abs(measured[1]) > MOTION[1]
         if self._anchor is None or moved or has_moved(self._anchor, pose, *MOTION):
             self._moved = self._moved or self._anchor is not None
             self._restart(pose)

@@ -21,6 +21,7 @@ import inspect
 from itertools import islice
 import platform
 import sys
+import time
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -219,8 +220,8 @@ class BaseNode(Node, Generic[P]):
         return self.now_ns() != 0
 
     def steady_ns(self) -> int:
-        """Return monotonic time, ns, for timeouts."""
-        return int(self._steady.now().nanoseconds)
+        """Return monotonic time, ns, for timeouts: that of the clock of the steady timers."""
+        return time.monotonic_ns()
 
     def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Any:
         """Return a timer that calls ``callback`` every ``period`` seconds of steady time."""

@@ -264,10 +264,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if not self._steps:
             self._odometry_frame = ros_messages.frame_from_serialized(message)
         command, status = self._controller.step(measured)
+        now_ns = self.now_ns()
         if self._controller.odometry_used or self._last_odometry_ns is None:
             self._last_odometry_ns = self.steady_ns()
             # Stamps are ahead of their receipt by a constant, but for the time on the way.
-            self._received_ns, self._stamp_ns = self.now_ns(), measured.stamp_ns
+            self._received_ns, self._stamp_ns = now_ns, measured.stamp_ns
         self._publish_command(command, status.stamp_ns)
         # Poses alone are differentiated, which says little about a gain.
         known = None if self._controller.odometry_twist.replaced else self._last_command
@@ -276,7 +277,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if not self._controller.doubts_odometry:
             periods = self._controller.stamp_filter.periods
             self._odometry_monitor.update(
-                measured, self.now_ns(), known, following=following, periods=periods
+                measured, now_ns, known, following=following, periods=periods
             )
         self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
