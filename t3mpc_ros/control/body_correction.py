@@ -32,7 +32,8 @@ a second, and starts from what is stated of each.
 To steps and gyro, k_w and s are one quantity. How an error is shared between them follows from
 the stated deviations, ``wheel_tolerance`` and ``gyro_scale_tolerance``: with a calibrated gyro it
 is the robot's, with one that has the tolerance of its data sheet it is the gyro's. A sudden error
-that lasts is a jump of the bias first; what contradicts that later returns to the gains.
+that lasts is a jump of the bias first; what contradicts that later returns to the gains, and the
+more of it at once the more jumps there have been.
 
 The reference of the law becomes
 
@@ -93,12 +94,16 @@ WALK = (0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.0003, 0.0005)
 NOISE, SLOPE_NOISE = 0.006, 0.01
 """Standard deviation of the mean of a block, rad/s, and per slope of w_c, s."""
 SUDDEN = 3.0  # innovation (in its standard deviation) that is not learnt
-SLACK, LARGEST, JUMP = 1.5, 4.0, 6.0
+SLACK, LARGEST, JUMP, JUMP_AGAIN = 1.5, 4.0, 6.0, 4.5
 """Of a cumulative sum of innovations (in their standard deviations, at most LARGEST): what a block
-takes off, and the sum at which the bias has jumped; three blocks in a row at least. Page 1954, doi
-10.1093/biomet/41.1-2.100."""
-JUMP_SHARE = 0.5
-"""Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``."""
+takes off, the sum at which the bias has jumped, three blocks in a row at least, and the one soon
+after another jump, two blocks. Page 1954, doi 10.1093/biomet/41.1-2.100."""
+JUMP_SHARE, JUMP_GROWTH, JUMP_TIME = 3.0, 30.0, 60.0
+"""Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``; by
+how much more for each jump before, by which that of the bias is divided; and the time in which
+these are forgotten, s. The bias of a gyro jumps once, a floor that changes does so many times.
+With 5 at the first jump, one of 0.05 rad/s turns the robot by 0.04 rad, with 0.5 by nothing; but
+with that and no growth, two floors in strips cost a quarter more."""
 WARNED_BIAS = 0.01  # bias that is reported, rad/s
 WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
 """Scale error that is reported, where the error of the robot beside it is so uncertain."""
@@ -188,6 +193,7 @@ class BodyMemory(Structure):
     spoilt: bool  # whether nothing is learnt from the block
     torn: bool  # whether a single step of it is no property of the robot
     torn_share: float  # share of such blocks
+    jumps: float  # number of jumps of late
     above: float
     below: float  # cumulative sums of positive and of negative innovations
     raw_power: float
@@ -223,7 +229,7 @@ WATCH = (
 RING_SUMS = 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'
 """Fields by which :attr:`BodyCorrection.turning_frequency` is known."""
 DRIVE = (
-    *('started', 'yaw_error', 'commands', 'above', 'below'),
+    *('started', 'yaw_error', 'commands', 'above', 'below', 'jumps'),
     *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt', 'torn'),
     *('before_achieved', 'last_achieved', 'last_rest'),
     *(*WATCH, 'rings', 'chain', *RING_SUMS),
@@ -676,13 +682,15 @@ def learn_block(constants: BodyConstants, state: BodyState, rough: float) -> Non
         memory.residual_power += share * (residual * residual - memory.residual_power)
     update_authority(memory)
     score = min(max(score, -LARGEST), LARGEST)
+    memory.jumps -= min(time / JUMP_TIME, 1.0) * memory.jumps
     memory.above = max(memory.above + score - SLACK, 0.0)
     memory.below = max(memory.below - score - SLACK, 0.0)
-    if max(memory.above, memory.below) >= JUMP:
+    if max(memory.above, memory.below) >= (JUMP if memory.jumps < 1.0 else JUMP_AGAIN):
         memory.above = memory.below = 0.0
-        covariance[BIAS, BIAS] += residual * residual
+        covariance[BIAS, BIAS] += residual * residual / (1.0 + memory.jumps)
         for j in (ASYMMETRY, TURNING):
-            covariance[j, j] += constants.jump_variance
+            covariance[j, j] += (1.0 + JUMP_GROWTH * memory.jumps) * constants.jump_variance
+        memory.jumps += 1.0
         variance = spread(row, covariance, gain) + noise
     elif sudden:
         return

@@ -199,6 +199,25 @@ def test_a_jump_of_the_bias_turns_no_robot(bias):
 
 
 @pytest.mark.compiled
+@pytest.mark.parametrize(('strip', 'left'), [(4.0, 0.8), (8.0, 0.55)])
+def test_a_floor_that_changes_again_and_again_is_followed(strip, left):
+    """Each change was once a jump of the bias: two floors had more error than with two gains."""
+
+    def floors(right, left):
+        other = math.floor(body.k * PERIOD / strip) % 2
+        return exact(right, left) / (1.06 if other else 1.0)
+
+    def run(**changes):
+        nonlocal body
+        body = Body(floors, noise=0.01, **changes)
+        return (body.run(60.0) - uncorrected(60.0))[2000:]
+
+    body = None
+    before, after = run(max_correction=0.0, max_yaw_correction=0.0), run()
+    assert rms(after) < left * rms(before)
+
+
+@pytest.mark.compiled
 def test_a_bias_and_wrong_wheels_are_told_apart():
     body = Body(miscalibrated, noise=0.01)
     body.run(20.0)
