@@ -302,6 +302,9 @@ FAULTS: Mapping[str, Fault] = {
     'pose set by 1 m': Fault(
         send=with_pose(lambda link, k, pose: {'x': pose.x + (k >= AFTER)}), begin=BEGIN
     ),
+    'pose drifts by 2 cm/s': Fault(
+        send=with_pose(lambda link, k, pose: {'x': pose.x + 0.02 * k / RATE})
+    ),
     'yaw frozen': Fault(send=with_pose(frozen_yaw), begin=BEGIN),
     'one message not finite': Fault(
         send=with_pose(lambda link, k, pose: {'x': math.nan} if k == AFTER else {}), begin=BEGIN

@@ -541,7 +541,9 @@ class Controller:
             return self._wait(odometry)
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamped)
-        odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
+        odometry = self.odometry_twist.measured(
+            odometry, restart=elapsed is None, command=self._followed_command()
+        )
         disbelieved = self._disbelieve_twist()
         if disbelieved:
             elapsed = None  # the speeds before were no measurements: all estimates begin again
@@ -658,6 +660,15 @@ class Controller:
         """Assume a robot that follows its commands."""
         self._response.reset()
         self._pose_response.reset()
+
+    def _followed_command(self) -> BodyTwist | None:
+        """Return the command that the robot follows now, if it drives: that of the dead time."""
+        if not self._moving:
+            return None
+        delay = self._dead_time + self.parameters.speed_filter.lag
+        # The newest one was sent a period ago, speeds are means over a period.
+        wheels = self._response.command(max(round(delay / self._period - 0.5), 0))
+        return None if wheels is None else twist_from_wheels(wheels, self.parameters.geometry)
 
     def _is_responsive(self, speeds: Array) -> bool:
         """Whether the robot follows commands, by the speeds (rad/s) that are used."""

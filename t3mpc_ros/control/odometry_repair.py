@@ -205,6 +205,12 @@ POSE_NOISE = 0.005, 0.05
 wheels with 0.04 (rad/s)²."""
 SIDEWAYS = 0.2
 """Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
+OBEYED = 0.2
+"""Square of the difference between twist and commands, over that between twist and pose, up to
+which it is the pose that is wrong: it drifts."""
+RADIUS_FACTORS, ASIDE = (0.8, 1.25), 0.1
+"""Factors of the twist of wheels that obey and have another radius than is set, where the pose is
+right; and the square by which a pose that drifts goes aside, over that of the difference."""
 FAR, FAR_BEYOND, FAR_UNCHANGED = 5.0, (1.0, 5.0), 4.0
 """A twist (m/s, rad/s) contradicts the change of the pose from this multiple of it and this excess
 on: 0.001 m/s in millimetres, 0.1 rad/s in degrees are found, wheels that slip are not. Where the
@@ -279,6 +285,11 @@ class VelocityFit:
         """Sum of the squares of the rate that a factor of the twist leaves."""
         left = self._normal[0, 0] - self._product[0] ** 2 / max(self._square, 1e-12)
         return float(left)
+
+    @property
+    def difference(self) -> float:
+        """Sum of the squared differences of twist and rate."""
+        return self._apart
 
     @property
     def _is_offset(self) -> bool:
@@ -389,6 +400,8 @@ class TwistFit:
         self._held = HeldTwist()
         self._shifted = [0.0] * (EARLY_STEPS + 1)
         """Squared differences of the pose from the twist, by delays of the twist, (m/s)²."""
+        self._disobeyed = 0.0  # sum of the squared differences of twist and commands, (m/s)²
+        self.pose_drifts = False  # whether twist and commands agree, and the pose with neither
         self.driven = 0.0  # time for which the twist has been that of a robot that moves, s
         self._aside = self._interval = 0.0
         self._age = 0.0  # driving time since something was wrong, s
@@ -410,8 +423,13 @@ class TwistFit:
         self.wrong, self.factor, self._age = 'the robot follows its commands by', 1.0, 0.0
         self.uses_pose = [True, True]
 
-    def update(self, new: State, motion: tuple[float, float, float]) -> None:
-        """Compare the twist of a message with the motion since the last one."""
+    def update(
+        self, new: State, motion: tuple[float, float, float], command: BodyTwist | None = None
+    ) -> None:
+        """Compare the twist of a message with the motion since the last one.
+
+        ``command``: what the robot follows now, if it is one that does.
+        """
         last, self._from = self._from, new
         if last is None:
             return
@@ -433,7 +451,8 @@ class TwistFit:
             self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
             return
         ahead, left, turn = motion
-        given = [ahead / elapsed, turn / elapsed, *twist, left / elapsed]
+        asked = ahead / elapsed if command is None else command.linear
+        given = [ahead / elapsed, turn / elapsed, *twist, left / elapsed, asked]
         if self._is_gap(given, elapsed):
             self.interrupt()
             return
@@ -501,6 +520,7 @@ class TwistFit:
             fit.add(row, means[i + 2][1], rough)
         kept = 1.0 - FIT_ROW / FIT_MEMORY
         self._aside = kept * self._aside + means[4][1] ** 2
+        self._disobeyed = kept * self._disobeyed + (means[2][1] - means[5][1]) ** 2
         self._shift(kept)
         self.pose_lateness = self._find_pose_lateness()
         self._age += FIT_ROW
@@ -563,6 +583,7 @@ class TwistFit:
 
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
+        self.pose_drifts = False
         if self.pose_lateness:
             return '', 1.0
         late, turns_late = self._find_late()
@@ -593,12 +614,17 @@ class TwistFit:
         shifted = abs(offset) > OFFSET_TOLERANCE and linear.is_certain(2, TWIST_CERTAIN)
         follows = linear.unexplained < UNLIKE[0] ** 2 * way and linear.roughness < ROUGH**2 * way
         wrong, common = '', 1.0
+        self.pose_drifts = (
+            (scaled or shifted or late or not follows)
+            and self._disobeyed < OBEYED * linear.difference
+            and not (scaled and follows and not (shifted or late) and self._is_radius(factor))
+        )
         if self._held.is_late(interval):
             mean = self._held.late(interval)
             held = 2.0 * mean + interval
             wrong = f'its velocities are held for {held:.2g} s, {mean:.3f} s behind'
         # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
-        elif self._aside > SIDEWAYS**2 * linear.rows * linear.motion:
+        elif self._aside > SIDEWAYS**2 * linear.rows * linear.motion or self.pose_drifts:
             pass
         elif linear.unexplained > UNLIKE[1] ** 2 * way or (
             not follows and (scaled or shifted or late)
@@ -623,6 +649,11 @@ class TwistFit:
         if not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
             return f'its angular velocity is {turns:.3f} times'
         return ''
+
+    def _is_radius(self, factor: float) -> bool:
+        """Whether a factor may be that of wheels of another radius: they do not go aside."""
+        least, most = RADIUS_FACTORS
+        return least < factor < most and self._aside < ASIDE * self._fits[0].difference
 
     def _is_common(self, factor: float) -> bool:
         """Whether the angular velocity has the factor of the linear one, as far as is known."""
@@ -815,8 +846,10 @@ class OdometryTwist:
 
     @property
     def pose_is_prompt(self) -> bool:
-        """Whether the pose is new in each message, and of its time, as far as is known."""
-        return not (self._by_pose.holds or self.pose_is_late or self._fit.pose_is_behind)
+        """Whether the pose is new in each message, of its time and right, as far as is known."""
+        fit = self._fit
+        late = self._by_pose.holds or self.pose_is_late or fit.pose_is_behind
+        return not (late or fit.pose_drifts)
 
     @property
     def pose_is_proven(self) -> bool:
@@ -870,6 +903,12 @@ class OdometryTwist:
                 f'the pose in odom says {late:.1f} s later what its twist says, no turn is '
                 'corrected by it: stamp the pose with the time of its measurement'
             )
+        if self._fit.pose_drifts:
+            return (
+                'the pose in odom moves otherwise than its twist and the commands, which agree: '
+                'the twist is used; see whether the localisation or camera of the pose drifts, or '
+                'whether something carries the robot'
+            )
         if self._fit.factor == 1.0:
             return ''
         return (
@@ -877,8 +916,13 @@ class OdometryTwist:
             'divided by that: correct radius or units of the wheels in the driver of the robot'
         )
 
-    def measured(self, odometry: State, *, restart: bool) -> State:
-        """Return an odometry with its twist; a ``restart`` follows no message before it."""
+    def measured(
+        self, odometry: State, *, restart: bool, command: BodyTwist | None = None
+    ) -> State:
+        """Return an odometry with its twist; a ``restart`` follows no message before it.
+
+        ``command``: the one that the robot follows now, None where it follows none.
+        """
         if not odometry.is_finite():
             return odometry
         last, self._last = self._last, odometry
@@ -897,7 +941,7 @@ class OdometryTwist:
         if last is None or motion is None or self.missing or self._units.wrong:
             self._fit.interrupt()
         elif self.known:
-            self._fit.update(odometry, motion)
+            self._fit.update(odometry, motion, command)
         return self._repaired(odometry, None if last is None else by_pose)
 
     def _add_twist(

@@ -26,6 +26,7 @@ from t3mpc_ros.geometry.types import (
     BodyTwist,
     Pose,
     State,
+    WheelSpeeds,
     has_moved,
     is_out_of_order,
     motion_between,
@@ -285,6 +286,11 @@ class ResponseMonitor:
     def add_command(self, right: float, left: float) -> None:
         """Store the wheel speeds commanded at this step, rad/s."""
         self._commands.append((right, left))
+
+    def command(self, age: int) -> WheelSpeeds | None:
+        """Return the wheel speeds commanded that many steps before the newest; None: unknown."""
+        known = 0 <= age < len(self._commands)
+        return WheelSpeeds(*self._commands[-1 - age]) if known else None
 
     def update(self, right: float, left: float) -> bool:
         """Return whether the robot follows commands, given measured wheel speeds, rad/s."""

@@ -291,7 +291,15 @@ WRONG = {
 
 
 def contradicted(
-    changed, *, seed=1, seconds=20.0, noise=(0.005, 0.06), moved=None, motion=turning, watch=None
+    changed,
+    *,
+    seed=1,
+    seconds=20.0,
+    noise=(0.005, 0.06),
+    moved=None,
+    motion=turning,
+    watch=None,
+    command=None,
 ):
     """Return twist monitor and the errors of the used twists, of a drive with a false twist."""
     generator, twist, errors = np.random.default_rng(seed), OdometryTwist(), []
@@ -303,7 +311,9 @@ def contradicted(
         given = given + noise * generator.standard_normal(2) * (given != 0.0)
         seen = pose if moved is None else moved(k, pose, generator)
         used = twist.measured(
-            State(k * 10 * MS, seen, BodyTwist(*given.tolist())), restart=k == 0
+            State(k * 10 * MS, seen, BodyTwist(*given.tolist())),
+            restart=k == 0,
+            command=command and BodyTwist(*command(0.01 * k)),
         ).twist
         errors.append(np.array(used) - history[-1])
         if watch:
@@ -320,6 +330,63 @@ def test_a_twist_that_the_pose_contradicts_is_replaced(fault, seed):
     assert text in twist.problem()
     assert twist.problem().startswith('the twist in odom is wrong: its ')
     assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+DRIFTS = {
+    'ahead': lambda k: (0.0002 * k, 0.0),
+    'to the left': lambda k: (0.0, 0.0002 * k),
+    'backwards from 8 s on': lambda k: (-0.0002 * max(k - 800, 0), 0.0),
+    'fast': lambda k: (0.0005 * k, 0.0),
+    'to and fro': lambda k: (0.05 * math.sin(0.01 * k), 0.05 * math.cos(0.007 * k)),
+}
+
+
+@pytest.mark.parametrize('drift', DRIFTS)
+@pytest.mark.parametrize('late', [0.0, 0.02])
+def test_a_pose_that_drifts_replaces_no_twist_that_obeys(drift, late):
+    """The twist was replaced by it: 2 cm/s had up to 13 times the settled error."""
+
+    def moved(k, pose, generator):
+        x, y = DRIFTS[drift](k)
+        return pose._replace(x=pose.x + x, y=pose.y + y)
+
+    replaced, said = [], set()
+
+    def watch(twist):
+        replaced.append(twist.replaced)
+        said.add(twist.problem()[:48])
+
+    contradicted(
+        lambda k, pose, history: history[k],
+        moved=moved,
+        watch=watch,
+        command=lambda time: turning(time - late),
+    )
+    assert not any(replaced)
+    assert 'the pose in odom moves otherwise than its twist ' in said
+
+
+@pytest.mark.parametrize('fault', WRONG)
+def test_a_twist_that_does_not_obey_is_replaced(fault):
+    changed, text = WRONG[fault]
+    twist, errors = contradicted(changed, command=turning)
+    assert text in twist.problem()
+    assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+@pytest.mark.parametrize('factor', [0.85, 1.2])
+def test_wheels_of_another_radius_drive_by_the_pose(factor):
+    """They obey, and their twist is what was commanded: the pose says how fast the robot is."""
+
+    def driven(time):
+        return tuple(factor * each for each in turning(time))
+
+    twist, errors = contradicted(
+        lambda k, pose, history: turning(0.01 * k), motion=driven, command=turning
+    )
+    said = float(twist.problem().split('is ')[1].split(' ')[0])
+    assert said == pytest.approx(1.0 / factor, rel=0.01)
+    assert np.abs(errors[-500:]).mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.06)
 
 
 def blank(is_blank, change=lambda given: given):
