@@ -427,7 +427,7 @@ class Controller:
                 f'command_shaper.turning_frequency is {frequency:g} Hz: commands are shaped for '
                 'the measured one; set both frequencies'
             )
-        found.append(self.body.problem())
+        found.append(self.body.problem() or self.odometry_twist.turn_problem())
         if not self.stamp_filter.jitters:  # what is left of it is rough, too
             found.append(self.body.response_problem())
         return [text for text in found if text]

@@ -177,6 +177,9 @@ TWIST_TOLERANCE, OFFSET_TOLERANCE = 0.05, 0.004
 """Deviation of the factor of the linear velocity from 1, and its offset (m/s), that count."""
 ANGULAR_FACTORS = 0.5, 2.0
 """Factors of the angular velocity beyond which no wheels, gyro or slip explain them."""
+SHARE_TOLERANCE, TURN_CERTAIN = 0.1, 6.0
+"""Share of the way in the angular velocity that is said, rad/m; standard deviations of a factor of
+it: the noise of the wheels is in it, too."""
 LATE, LATE_PERIODS = 0.005, 0.6
 """Time by which the linear velocity is behind the pose that counts: s, and share of the interval
 of the messages, as the mean over two of them is half of it late."""
@@ -650,6 +653,18 @@ class TwistFit:
             return f'its angular velocity is {turns:.3f} times'
         return ''
 
+    def turn_difference(self) -> str:
+        """Return by what the angular velocity certainly differs from the change of the yaw."""
+        turn = self._fits[1]
+        if not self.is_compared or self.pose_lateness or self.pose_is_behind:
+            return ''
+        found = []
+        if abs(turn.values[0] - 1.0) > TWIST_TOLERANCE and turn.is_certain(0, TURN_CERTAIN):
+            found.append(f'is {turn.values[0]:.2f} times the change of its yaw')
+        if abs(turn.values[3]) > SHARE_TOLERANCE and turn.is_certain(3, TWIST_CERTAIN):
+            found.append(f'has {turn.values[3]:+.2f} rad per metre of the way beyond its yaw')
+        return ' and '.join(found)
+
     def _is_radius(self, factor: float) -> bool:
         """Whether a factor may be that of wheels of another radius: they do not go aside."""
         least, most = RADIUS_FACTORS
@@ -914,6 +929,17 @@ class OdometryTwist:
         return (
             f'the twist in odom is {self._fit.factor:.3f} times the change of its pose, it is '
             'divided by that: correct radius or units of the wheels in the driver of the robot'
+        )
+
+    def turn_problem(self) -> str:
+        """Return by what an angular velocity that is used differs from the pose, and the remedy.
+
+        Gyro or wheels may be wrong: which of them, their stated deviations decide.
+        """
+        turn = '' if self.replaced else self._fit.turn_difference()
+        return turn and (
+            f'the angular velocity in odom {turn}: correct separation or radii of the wheels in '
+            'the driver of the robot, or calibrate its gyro'
         )
 
     def measured(

@@ -374,6 +374,23 @@ def test_a_twist_that_does_not_obey_is_replaced(fault):
     assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ('changed', 'text'),
+    [
+        (lambda k, pose, h: (h[k][0], 1.2 * h[k][1]), 'is 1.20 times the change of its yaw'),
+        (lambda k, pose, h: (h[k][0], h[k][1] - 0.3 * h[k][0]), 'has -0.30 rad per metre'),
+        (lambda k, pose, h: h[k], ''),
+    ],
+)
+def test_another_turn_than_that_of_the_yaw_is_named_and_used(changed, text):
+    """Nothing was said of a yaw rate that was 20 % too large, or of a right wheel 5 % too fast."""
+    twist, errors = contradicted(changed, noise=(0.002, 0.02), command=turning)
+    assert text in twist.turn_problem()
+    assert bool(text) == bool(twist.turn_problem())
+    assert not twist.problem()
+    assert not twist.replaced
+
+
 @pytest.mark.parametrize('factor', [0.85, 1.2])
 def test_wheels_of_another_radius_drive_by_the_pose(factor):
     """They obey, and their twist is what was commanded: the pose says how fast the robot is."""
