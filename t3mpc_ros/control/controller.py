@@ -105,6 +105,9 @@ MAX_MISSED = 20  # largest number of periods without a step through which a ramp
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
 are reported, s."""
+REPORTED_NOISE = 2.5, 0.08
+"""Noise of the wheel speeds that is reported: as a multiple of the configured one, and (rad/s)²; a
+rotor that rings makes up to 0.04."""
 INTERVALS, OTHER_RATE = 21, 0.02
 """Number of intervals between steps whose median is the time for which commands are held, and its
 relative difference from the period from which that counts."""
@@ -414,10 +417,11 @@ class Controller:
                 f'the robot responds after {in_use:.3f} s, speed_filter.dead_time is '
                 f'{configured:g} s: the estimate is in use; set the parameter'
             )
+        noise = self._noise_problem()
         if self._disturbed_for > REPORTED_DISTURBANCE:
             found.append(
                 'the response to the commands is disturbed, nothing is learnt from it: commands '
-                'or odometry are late, or the dead time has changed'
+                f'or odometry are late, or the dead time has changed{noise and ", or "}{noise}'
             )
         found.append(self._reference_problem())
         frequency = self.parameters.command_shaper.turning_frequency
@@ -430,7 +434,7 @@ class Controller:
         found.append(self.body.problem() or self.odometry_twist.turn_problem())
         if not self.stamp_filter.jitters:  # what is left of it is rough, too
             found.append(self.body.response_problem())
-        return [text for text in found if text]
+        return [text for text in found if text] or ([noise] if noise else [])
 
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: those of the law, and the gains of the body."""
@@ -865,6 +869,17 @@ class Controller:
             f'the newest reference is stamped {abs(lead):.3f} s {side} odom, and the robot '
             f'responds after {self._dead_time:.3f} s: it follows late; raise the lead of the '
             'reference (lead of reference_generator, 0.4 s), or synchronise the clocks'
+        )
+
+    def _noise_problem(self) -> str:
+        """Return that the odometry has more noise than is set; late messages look alike."""
+        configured = self.parameters.speed_filter.noise_variance
+        noise = self.dead_time.noise_variance
+        if not noise > max(REPORTED_NOISE[0] * configured, REPORTED_NOISE[1]):
+            return ''
+        return (
+            f'the wheel speeds by the twist in odom have a noise of {noise:.2g} (rad/s)², '
+            f'speed_filter.noise_variance is {configured:g}: set the parameter'
         )
 
     def _check_shaper(self) -> None:

@@ -269,6 +269,11 @@ class DeadTimeEstimator:
         """Standard deviation of the estimate from the noise, s."""
         return float(self._state['deviation'][0])
 
+    @property
+    def noise_variance(self) -> float:
+        """Noise of the measured speeds by the median of its changes, (rad/s)²."""
+        return (float(self._state['change'][0]) / WHITE_MEDIAN) ** 2
+
     def evidence_against(self, dead_time: float) -> float:
         """Return 2 log of the likelihood ratio of the best dead time and another one, s.
 

@@ -292,6 +292,24 @@ def test_noise_of_the_measurement_cancels_in_the_command(lag, composition):
     assert passed < 0.1
 
 
+@pytest.mark.parametrize(('deviation', 'named'), [(0.0, False), (0.2, False), (0.45, True)])
+def test_more_noise_than_is_set_is_named(deviation, named):
+    """It was said to be late commands, or not at all."""
+    loop = Loop(
+        lambda t: (0.12 + 0.1 * math.sin(2.1 * t), 1.5 * math.sin(1.7 * t)),
+        composition='body',
+        estimate_dead_time=True,
+        **{'law.gain': 0.0, 'speed_filter.noise_variance': 0.04, 'speed_filter.lag': 0.003},
+    )
+    generator = np.random.default_rng(3)
+    for _ in range(400):
+        noise = generator.normal(0.0, deviation, 2)
+        wheels = np.array(wheels_from_twist(loop.twist, GEOMETRY)) + noise
+        loop.step(State(loop.now, ORIGIN, twist_from_wheels(WheelSpeeds(*wheels), GEOMETRY)))
+    found = [each for each in loop.controller.problems() if 'noise_variance is 0.04' in each]
+    assert bool(found) == named
+
+
 def test_a_dead_time_that_nobody_configured_is_found():
     """Robot with 50 ms in place of 10 ms: the plan is then early by the missing 40 ms."""
 
