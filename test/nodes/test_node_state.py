@@ -134,7 +134,7 @@ KEPT = {
         PREDICTIVE,
     ),
     'sim_robot': ('_robot.', '_real_time_factor', '_simulated_time', *SERIALIZED),
-    'radio_bridge': SERIALIZED,
+    'radio_bridge': ('_wake_read', '_wake_write', *SERIALIZED),  # numbers of open files
     'player': ('_opened_ns', '_thread._timeline._anchor', '_thread._timeline._primed'),
 }
 """What depends on the time of the start, or counts changes."""
