@@ -104,6 +104,9 @@ how much more for each jump before, by which that of the bias is divided; and th
 these are forgotten, s. The bias of a gyro jumps once, a floor that changes does so many times.
 With 5 at the first jump, one of 0.05 rad/s turns the robot by 0.04 rad, with 0.5 by nothing; but
 with that and no growth, two floors in strips cost a quarter more."""
+JUMP_LIKELY = 0.1
+"""Share of the wheel speeds up to which such a change may be one of the gains: of a robot that
+loses steps it is more, and its gains are the same afterwards."""
 WARNED_BIAS = 0.01  # bias that is reported, rad/s
 WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
 """Scale error that is reported, where the error of the robot beside it is so uncertain."""
@@ -687,10 +690,12 @@ def learn_block(constants: BodyConstants, state: BodyState, rough: float) -> Non
     memory.below = max(memory.below - score - SLACK, 0.0)
     if max(memory.above, memory.below) >= (JUMP if memory.jumps < 1.0 else JUMP_AGAIN):
         memory.above = memory.below = 0.0
-        covariance[BIAS, BIAS] += residual * residual / (1.0 + memory.jumps)
-        for j in (ASYMMETRY, TURNING):
-            covariance[j, j] += (1.0 + JUMP_GROWTH * memory.jumps) * constants.jump_variance
-        memory.jumps += 1.0
+        likely = abs(residual) < JUMP_LIKELY * (abs(row[ASYMMETRY]) + abs(row[TURNING]))
+        covariance[BIAS, BIAS] += residual * residual / (1.0 + likely * memory.jumps)
+        if likely:
+            for j in (ASYMMETRY, TURNING):
+                covariance[j, j] += (1.0 + JUMP_GROWTH * memory.jumps) * constants.jump_variance
+            memory.jumps += 1.0
         variance = spread(row, covariance, gain) + noise
     elif sudden:
         return
