@@ -99,9 +99,9 @@ SLACK, LARGEST, JUMP, JUMP_AGAIN = 1.5, 4.0, 6.0, 4.5
 takes off, the sum at which the bias has jumped, three blocks in a row at least, and the one soon
 after another jump, two blocks. Page 1954, doi 10.1093/biomet/41.1-2.100."""
 JUMP_SHARE, JUMP_GROWTH, JUMP_TIME = 3.0, 30.0, 60.0
-"""Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``; by
-how much more for each jump before, by which that of the bias is divided; and the time in which
-these are forgotten, s. The bias of a gyro jumps once, a floor that changes does so many times.
+"""Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``;
+how often it is added again for each jump of late, beside less for the bias; and the time in
+which they are forgotten, s. The bias of a gyro jumps once, a floor that changes does so often.
 With 5 at the first jump, one of 0.05 rad/s turns the robot by 0.04 rad, with 0.5 by nothing; but
 with that and no growth, two floors in strips cost a quarter more."""
 JUMP_LIKELY = 0.1

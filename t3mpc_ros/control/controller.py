@@ -377,8 +377,12 @@ class Controller:
         """Most time from a command to its effect in the odometry, s; None: not estimated."""
         if not self.parameters.estimate_dead_time:
             return None
-        lag = self.parameters.speed_filter.lag
-        return self._dead_time + lag + 4.0 * self.dead_time.standard_deviation
+        return self._delay + 4.0 * self.dead_time.standard_deviation
+
+    @property
+    def _delay(self) -> float:
+        """Dead time in use and lag: from a command to the motion it causes, s."""
+        return self._dead_time + self.parameters.speed_filter.lag
 
     @property
     def gain(self) -> float:
@@ -669,9 +673,8 @@ class Controller:
         """Return the command that the robot follows now, if it drives: that of the dead time."""
         if not self._moving:
             return None
-        delay = self._dead_time + self.parameters.speed_filter.lag
         # The newest one was sent a period ago, speeds are means over a period.
-        wheels = self._response.command(max(round(delay / self._period - 0.5), 0))
+        wheels = self._response.command(max(round(self._delay / self._period - 0.5), 0))
         return None if wheels is None else twist_from_wheels(wheels, self.parameters.geometry)
 
     def _is_responsive(self, speeds: Array) -> bool:
@@ -818,14 +821,13 @@ class Controller:
             self._shaper.step(planned, elapsed)
             planned, rate = self._shaper.reference, self._shaper.rate
         if corrects_body:
-            filtered = self.parameters.speed_filter
             correction = self.body.step(
                 yaw,
                 elapsed,
                 self._sampled.reference,
                 planned,
                 self.actuation.command,
-                self._dead_time + filtered.lag + 0.5 * self._period,
+                self._delay + 0.5 * self._period,
                 learn=not self.disturbed,
             )
             self._check_shaper()
@@ -901,8 +903,7 @@ class Controller:
 
     def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""
-        parameters, geometry = self.parameters, self.parameters.geometry
-        horizon = self._dead_time + parameters.speed_filter.lag
+        geometry, horizon = self.parameters.geometry, self._delay
         reference = self._pose_reference.at(odometry.stamp_ns + round(horizon * NANOSECONDS))
         if reference is None:
             return
