@@ -21,7 +21,6 @@ for each message of a chunk, which takes four times as long as unpacking its hea
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from io import SEEK_END, BytesIO
 from operator import attrgetter
@@ -72,17 +71,6 @@ class SerializedMessage(NamedTuple):
 
 
 RECEIVE_TIME = attrgetter('received_ns')
-
-
-@dataclass(frozen=True, slots=True)
-class Attachment:
-    """File stored inside a bag, such as the model file of a controller."""
-
-    name: str
-    media_type: str
-    data: bytes
-    modified_ns: int = 0
-    """Modification time, nanoseconds since 1970; 0 = unknown."""
 
 
 class FileWindow:
@@ -287,19 +275,17 @@ class McapFile:
                 return bytes(schema.data).decode()
         return ''
 
-    def attachments(self) -> list[tuple[int, Attachment]]:
-        """Return the attachments, each with the time at which it was read."""
+    def attachments(self) -> list[records.Attachment]:
+        """Return the attachments."""
         with self.path.open('rb') as file, read_errors(f'the attachments of {self.path}'):
             window = FileWindow(file)
             found = []
             for index in self._summary.attachment_indexes:
                 try:
-                    item, _ = read_record(window, index.offset)
+                    found.append(read_record(window, index.offset)[0])
                 except RecordError as error:
                     text = f'the attachment {index.name} of {self.path} is damaged'
                     raise BagError(text) from error
-                copy = Attachment(item.name, item.media_type, item.data, item.create_time)
-                found.append((item.log_time, copy))
             return found
 
     def attachment_sizes(self) -> list[tuple[str, str, int]]:

@@ -26,6 +26,7 @@ from pathlib import Path
 import re
 from typing import Any, Self
 
+from mcap.records import Attachment
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Ros1Reader
@@ -194,12 +195,11 @@ class BagReader:
         names = ['received', 'stamp', *fields]
         return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
-    def attachments(self) -> dict[str, mcap_file.Attachment]:
+    def attachments(self) -> dict[str, Attachment]:
         """Return the attachments by name; the newest of each name."""
         files = [file for file in self.files if isinstance(file, mcap_file.McapFile)]
-        found = [pair for file in files for pair in file.attachments()]
-        found.sort(key=lambda pair: pair[0])
-        return {item.name: item for _, item in found}
+        found = [item for file in files for item in file.attachments()]
+        return {item.name: item for item in sorted(found, key=attrgetter('log_time'))}
 
     def close(self) -> None:
         """Close the files; idempotent."""

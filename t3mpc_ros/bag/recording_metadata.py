@@ -16,7 +16,8 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from t3mpc_ros.bag.mcap_file import Attachment
+from mcap.records import Attachment
+
 from t3mpc_ros.bag.writer import AttachmentError, read_attachment
 from t3mpc_ros.model_file import find_model
 from t3mpc_ros.parameters.version_and_commit import provenance
@@ -38,10 +39,11 @@ class RecordingMetadata:
         self._start_ns = now_ns
         self._model_outputs: dict[str, Path] = {}
         self.records: dict[str, dict[str, str]] = {'provenance': provenance()}
-        self.attachments: dict[str, tuple[Attachment, int]] = {}
-        """Attached files by name, with the time of reading."""
+        self.attachments: dict[str, Attachment] = {}
+        """Attached files by name."""
         for name in files:
-            self._attach(read_attachment(Path(name), max_bytes), now_ns)
+            item = read_attachment(Path(name), max_bytes, now_ns)
+            self.attachments[item.name] = item
 
     def add_parameters(
         self, record: str, node: str, values: Mapping[str, str], now_ns: int
@@ -56,10 +58,11 @@ class RecordingMetadata:
             return [], ''
         path = find_model(model)
         try:
-            found = read_attachment(path, self._max_bytes, _attachment_name(record, path.name))
+            name = _attachment_name(record, path.name)
+            found = read_attachment(path, self._max_bytes, now_ns, name)
         except AttachmentError as error:
             return [], str(error)
-        self._attach(found, now_ns)
+        self.attachments[name] = found
         return [found], ''
 
     def add_seed(self, node: str, fingerprint: str) -> bool:
@@ -70,23 +73,19 @@ class RecordingMetadata:
         return new
 
     def saved_models(self, now_ns: int) -> list[Attachment]:
-        """Return new attachments: the model files that controllers saved during the recording."""
+        """Return the model files that controllers saved during the recording."""
         found = []
         for record, path in self._model_outputs.items():
             name = _attachment_name(record, f'saved_{path.name}')
             try:
                 if path.stat().st_mtime_ns < self._start_ns:
                     continue  # saved by an earlier run
-                item = read_attachment(path, self._max_bytes, name)
+                item = read_attachment(path, self._max_bytes, now_ns, name)
             except (OSError, AttachmentError):
                 continue  # no model was saved, or not on this computer
-            if name not in self.attachments or self.attachments[name][0] != item:
-                self._attach(item, now_ns)
-                found.append(item)
+            self.attachments[name] = item
+            found.append(item)
         return found
-
-    def _attach(self, item: Attachment, now_ns: int) -> None:
-        self.attachments[item.name] = item, now_ns
 
 
 def _attachment_name(record: str, path: str) -> str:

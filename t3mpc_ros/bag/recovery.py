@@ -396,9 +396,7 @@ class _FileRecovery:
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, records.Attachment) and writer:
             writer.flush()
-            writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
+            writer.add_attachment(**vars(record))
 
     def _take_schema(self, record: records.Schema) -> None:
         if self._written.get((records.Schema, record.id), (None,))[0] != record:

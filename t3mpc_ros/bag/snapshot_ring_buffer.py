@@ -22,8 +22,10 @@ from datetime import datetime
 from pathlib import Path
 import re
 
+from mcap.records import Attachment
+
 from t3mpc_ros.bag.errors import BagError, DataError, UnknownTypeError
-from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.writer import BagWriter
@@ -124,7 +126,7 @@ class SnapshotWriter:
         reason: str,
         now_ns: int,
         metadata_records: Mapping[str, Mapping[str, str]],
-        attachments: Iterable[tuple[Attachment, int]],
+        attachments: Iterable[Attachment],
         finished: Callable[[bool, str], None],
     ) -> Path:
         """Start writing a snapshot and return its folder; raise :class:`BagError` if it cannot be.
@@ -150,8 +152,8 @@ class SnapshotWriter:
                 with BagWriter(
                     folder, metadata_records=records, definitions=self._definitions
                 ) as bag:
-                    for attachment, read_ns in attachments:
-                        bag.add_attachment(attachment, read_ns)
+                    for attachment in attachments:
+                        bag.add_attachment(attachment)
                     recorded = _add_topics(bag, topics, {each.topic for each in messages})
                     for message in messages:
                         if message.topic in recorded:

@@ -24,11 +24,12 @@ import re
 from typing import Self
 import weakref
 
+from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
 from t3mpc_ros.atomic_file import sync_folder
 from t3mpc_ros.bag.errors import BagError, DataError, UnknownTopicError
-from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
+from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, collect_metadata
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata_yaml import (
     BagMetadata,
@@ -71,7 +72,7 @@ class DiskError(BagError):
         super().__init__(f'recording into {path} failed: {reason}; {rest}')
 
 
-def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
+def read_attachment(path: Path, max_bytes: int, now_ns: int, name: str = '') -> Attachment:
     """Return the file at ``path`` as an attachment called ``name``, by default its file name."""
     try:
         with path.open('rb') as file:
@@ -85,9 +86,8 @@ def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
             '(record.max_attachment_size)'
         )
     media_type = _MEDIA_TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0]
-    return Attachment(
-        name or path.name, media_type or 'application/octet-stream', data, modified_ns
-    )
+    media_type = media_type or 'application/octet-stream'
+    return Attachment(modified_ns, now_ns, name or path.name, media_type, data)
 
 
 class BagWriter:
@@ -135,7 +135,7 @@ class BagWriter:
         self._definitions = definitions or MessageDefinitions()
         check_metadata_records(metadata_records)
         self._metadata_records = {title: dict(table) for title, table in metadata_records.items()}
-        self._attachments: dict[str, tuple[Attachment, int]] = {}
+        self._attachments: dict[str, Attachment] = {}
         self._topics: dict[str, TopicInformation] = {}
         self._closed = self._failed = False
         self._synced_ns = 0
@@ -185,8 +185,8 @@ class BagWriter:
             self._output.abandon()
             self.path.unlink(missing_ok=True)
             raise _folder_error(self.folder, error) from error
-        for attachment, read_ns in self._attachments.values():
-            self.add_attachment(attachment, read_ns)
+        for attachment in self._attachments.values():
+            self.add_attachment(attachment)
         for topic in self._topics.values():
             self._register(topic)
 
@@ -198,15 +198,12 @@ class BagWriter:
             with self._writing(sum(map(len, [title, *table, *table.values()]))):
                 self._writer.add_metadata(title, dict(table))
 
-    def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
-        """Write an attachment to this and all later files, with the time at which it was read."""
-        self._attachments[attachment.name] = attachment, read_ns
+    def add_attachment(self, item: Attachment) -> None:
+        """Write an attachment to this and all later files."""
+        self._attachments[item.name] = item
         if self._is_open():
-            item = attachment
             with self._writing(len(item.data)):
-                self._writer.add_attachment(
-                    item.modified_ns, read_ns, item.name, item.media_type, item.data
-                )
+                self._writer.add_attachment(**vars(item))
 
     def add_topic(
         self, name: str, type_name: str, profiles: Iterable[QosProfile] = (), type_hash: str = ''

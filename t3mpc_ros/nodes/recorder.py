@@ -29,7 +29,6 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.atomic_file import check_new_folder
 from t3mpc_ros.bag.errors import BagError, UnknownTypeError
-from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.recorded_losses import LOSSES, message_loss_record
 from t3mpc_ros.bag.recorder_parameters import RecordingParameters
@@ -137,8 +136,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
             max_file_ns=round(parameters.max_bagfile_duration * NANOSECONDS),
             definitions=self._definitions,
         )
-        for attachment, read_ns in self._metadata.attachments.values():
-            writer.add_attachment(attachment, read_ns)
+        for attachment in self._metadata.attachments.values():
+            writer.add_attachment(attachment)
         return writer
 
     def _make_snapshot_writer(self) -> SnapshotWriter:
@@ -237,13 +236,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
         if problem:
             self.get_logger().warning(f'the model of {record} is not attached: {problem}')
         self._submit(lambda writer: writer.add_metadata_record(record, values))
-        self._attach(files)
-
-    def _attach(self, files: list[Attachment]) -> None:
         for item in files:
-            self._submit(
-                partial(BagWriter.add_attachment, attachment=item, read_ns=time.time_ns())
-            )
+            self._submit(partial(BagWriter.add_attachment, item=item))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -363,7 +357,8 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._close()
 
     def _close(self) -> None:
-        self._attach(self._metadata.saved_models(time.time_ns()))
+        for item in self._metadata.saved_models(time.time_ns()):
+            self._submit(partial(BagWriter.add_attachment, item=item))
         self._write_losses()
         problem = self._writer.close()
         if problem and not self._failure:

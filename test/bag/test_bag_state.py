@@ -19,11 +19,12 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from mcap.records import Attachment
 import pytest
 from support.object_state import differences
 from support.properties import PROPERTY, STATEFUL
 
-from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ScheduledMessage
 from t3mpc_ros.bag.snapshot_ring_buffer import CircularMessageCache
@@ -60,8 +61,8 @@ def a_writer(source, folder):
     for path in used.folder.glob('*_0.mcap'):
         (folder / 'new' / 'bag' / path.name).write_bytes(path.read_bytes())
     fresh = BagWriter(folder / 'new' / 'bag', metadata_records=records, **options)
-    for attachment, read_ns in attachments.values():
-        fresh.add_attachment(attachment, read_ns)
+    for attachment in attachments.values():
+        fresh.add_attachment(attachment)
     for topic in used._topics.values():
         fresh.add_topic(topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
     # The disk is synchronized once a second, whatever the file.
@@ -83,8 +84,8 @@ def _do_something(writer, source, records, attachments):
         records[topic] = {'value': str(at_ns)}
         writer.add_metadata_record(topic, records[topic])
     elif action == 1:
-        attachments[topic] = Attachment(topic, 'text/plain', source.randbytes(3)), at_ns
-        writer.add_attachment(*attachments[topic])
+        attachments[topic] = Attachment(0, at_ns, topic, 'text/plain', source.randbytes(3))
+        writer.add_attachment(attachments[topic])
     elif action == 2:
         writer.tick(at_ns)
     else:

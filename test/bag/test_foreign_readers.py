@@ -22,12 +22,12 @@ import os
 from pathlib import Path
 import shutil
 
+from mcap.records import Attachment
 import pytest
 from support import waiting
 from support.bag_messages import STORE, number, odometry_message, serialised
 from support.missing_tools import needs, skip
 
-from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
 from t3mpc_ros.bag.writer import BagWriter
 
@@ -36,7 +36,7 @@ ODOM, NUMBER = 'nav_msgs/msg/Odometry', 'std_msgs/msg/Float64'
 START = 1_700_000_000_000_000_000
 STEP = 10_000_000
 DETAILS = {'settings': {'law.gain': '8.0', 'note': 'µ ∞'}, 'provenance': {'version': '0'}}
-ITEM = Attachment('model.npz', 'application/zip', b'a model file \x00\xff' * 50, START)
+ITEM = Attachment(START, START, 'model.npz', 'application/zip', b'a model file \x00\xff' * 50)
 
 
 @pytest.fixture(scope='module')
@@ -69,7 +69,7 @@ def test_every_file_of_a_bag_is_read_and_decoded(tmp_path, check):
     with BagWriter(tmp_path / 'run', metadata_records=DETAILS, chunk_bytes=8192) as bag:
         bag.add_topic('/number', NUMBER, [QosProfile()])
         bag.add_topic('/odom', ODOM)
-        bag.add_attachment(ITEM, START)
+        bag.add_attachment(ITEM)
         for i in range(600):
             now = START + i * STEP
             if i % 200 == 0:

@@ -24,6 +24,7 @@ import sys
 import threading
 import time
 
+from mcap.records import Attachment
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
@@ -33,7 +34,7 @@ from support.file_watch import Disk, no_file_left_open
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag import writer as writer_module
 from t3mpc_ros.bag.errors import BagError
-from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
+from t3mpc_ros.bag.mcap_file import has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata_yaml import BagMetadata, read_origin, write_metadata
 from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
@@ -59,7 +60,7 @@ REFUSED = BagError, ModelError, PortError, QosError, OSError, ValueError
 def mcap_bag(folder, topic='/a', count=20, close=True, type_name=NUMBER):
     made = BagWriter(folder, metadata_records={}, chunk_bytes=100, definitions=DEFINITIONS)
     made.add_topic(topic, type_name)
-    made.add_attachment(Attachment('a', 'text/plain', b'text'), START)
+    made.add_attachment(Attachment(0, START, 'a', 'text/plain', b'text'))
     for number in range(count):
         made.write(topic, START + number * 10**7, START, DATA)
     if close:
@@ -216,7 +217,7 @@ def a_recovery_of_nothing(folder):
 
 def an_attachment_that_is_too_large(folder):
     (folder / 'a').write_bytes(bytes(100))
-    read_attachment(folder / 'a', 10)
+    read_attachment(folder / 'a', 10, START)
 
 
 # -- other files ----------------------------------------------------------------------------------

@@ -18,13 +18,14 @@ import random
 import threading
 
 from mcap.reader import make_reader
+from mcap.records import Attachment
 import pytest
 from rosbags.rosbag2 import Reader
 from support.bag_files import kept_messages, messages_of, metadata_of
 
 from t3mpc_ros.bag import writer
 from t3mpc_ros.bag.errors import BagError
-from t3mpc_ros.bag.mcap_file import MESSAGE_OVERHEAD, Attachment, SerializedMessage, read_mcap_file
+from t3mpc_ros.bag.mcap_file import MESSAGE_OVERHEAD, SerializedMessage, read_mcap_file
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
@@ -55,6 +56,7 @@ SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 NUMBER = 'std_msgs/msg/Float64'
 OK, WARN, ERROR, STALE = range(4)
+ITEM = Attachment(0, START, 'a', 'text/plain', b'x')
 
 
 def message(topic, seconds, size=12, fill=1):
@@ -299,7 +301,7 @@ def test_disk_sync_at_most_once_per_second_and_only_for_new_data(tmp_path, monke
 def test_split_recording_is_complete_in_self_contained_files(tmp_path, options):
     folder = tmp_path / 'bag'
     bag = series(folder, chunk_bytes=8000, **options)
-    bag.add_attachment(Attachment('model.npz', 'application/zip', b'weights', 5), START)
+    bag.add_attachment(Attachment(5, START, 'model.npz', 'application/zip', b'weights'))
     bag.add_metadata_record('controller', {'law.gain': '8.0'})
     written = [noise(i / 10) for i in range(50)]
     for i, item in enumerate(written):
@@ -372,13 +374,13 @@ def test_losses_are_listed_by_cause_and_topic():
 def test_attachment_is_read_back_with_media_type_and_time(tmp_path):
     path = tmp_path / 'model.npz'
     with pytest.raises(AttachmentError, match='model.npz cannot be attached: No such file'):
-        read_attachment(path, 256)
+        read_attachment(path, 256, START)
     path.write_bytes(bytes(range(256)))
     with pytest.raises(AttachmentError, match='at most 255 bytes'):
-        read_attachment(path, 255)
-    item = read_attachment(path, 256, 'controller/model.npz')
+        read_attachment(path, 255, START)
+    item = read_attachment(path, 256, START, 'controller/model.npz')
     with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
-        bag.add_attachment(item, START)
+        bag.add_attachment(item)
         bag.add_topic('/n', NUMBER)
         bag.write('/n', START, START, message('/n', 0).data)
     (found,) = attachments(bag.path)
@@ -395,7 +397,7 @@ def test_attachment_is_read_back_with_media_type_and_time(tmp_path):
 def test_newest_attachment_of_a_name_is_read(tmp_path):
     with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
         for i in (1, 2):
-            bag.add_attachment(Attachment('a', 'text/plain', b'%d' % i), START + i)
+            bag.add_attachment(Attachment(0, START + i, 'a', 'text/plain', b'%d' % i))
     with open_bag(bag.path) as reader:
         assert reader.attachments()['a'].data == b'2'
         content = bag.path.read_bytes()
@@ -416,7 +418,7 @@ def test_a_full_disk_is_reported_by_an_attachment_too(tmp_path, monkeypatch):
 
     monkeypatch.setattr(bag._output, 'write', full)
     with pytest.raises(DiskError, match='No space left'):
-        bag.add_attachment(Attachment('a', 'text/plain', b'x'), START)
+        bag.add_attachment(ITEM)
 
 
 # -- snapshots ------------------------------------------------------------------------------------
@@ -466,7 +468,7 @@ def snapshots(tmp_path):
 def test_snapshot_is_a_bag_with_its_reason(snapshots):
     snapshots.add_topic(TopicInformation('/quiet', NUMBER))
     snapshots.add([message('/n', i / 10) for i in range(450)] + [message('/unknown', 50)])
-    folder, success, text = snapshots.take([(Attachment('a', 'text/plain', b'x'), START)])
+    folder, success, text = snapshots.take([ITEM])
     assert success
     assert text == f'snapshot of "fault": 450 messages in {folder}'
     with open_bag(folder) as reader:
@@ -486,7 +488,7 @@ def test_a_topic_that_appears_meanwhile_is_not_in_the_snapshot(snapshots):
 
     def attachments():
         snapshots.add_topic(TopicInformation('/late', NUMBER))
-        yield Attachment('a', 'text/plain', b'x'), START
+        yield ITEM
 
     folder, success, _ = snapshots.take(attachments())
     assert success
