@@ -30,7 +30,7 @@ from t3mpc_ros.atomic_file import atomic_file, sync_folder
 from t3mpc_ros.bag import mcap_file
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.metadata_yaml import read_origin, write_metadata
-from t3mpc_ros.bag.recorded_losses import LOSSES, damage_record
+from t3mpc_ros.bag.recording_metadata import LOSSES, damage_record
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 LIBRARY_MARK = 'recovered by t3mpc_ros'

@@ -132,7 +132,7 @@ def _info(bag: 'BagReader') -> dict[str, Any]:
 
 
 def _info_text(bag: 'BagReader') -> str:
-    from t3mpc_ros.bag.recorded_losses import message_loss_notes
+    from t3mpc_ros.bag.recording_metadata import message_loss_notes
 
     info = _info(bag)
     start = datetime.fromtimestamp(bag.start_ns // 10**9, UTC)

@@ -31,9 +31,8 @@ from t3mpc_ros.bag.qos import read_qos_overrides
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import topic_endpoints
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.player_publishers import CLOCK, TopicPublishers
+from t3mpc_ros.nodes.player_publishers import CLOCK, PlayerThread, TopicPublishers
 from t3mpc_ros.nodes.player_terminal import KeyboardHandler, ProgressLine
-from t3mpc_ros.nodes.player_thread import PlayerThread
 from t3mpc_ros.parameters.table import ParameterError, parameter
 
 SWITCH_INTERVAL = 0.0005

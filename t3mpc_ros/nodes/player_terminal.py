@@ -24,7 +24,7 @@ import threading
 from typing import TextIO
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.player_thread import PlaybackStatus
+from t3mpc_ros.nodes.player_publishers import PlaybackStatus
 
 BAR_WIDTH = 24
 """Width of the progress bar, characters."""

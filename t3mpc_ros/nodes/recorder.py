@@ -30,9 +30,13 @@ from std_srvs.srv import Trigger
 from t3mpc_ros.atomic_file import check_new_folder
 from t3mpc_ros.bag.errors import BagError, UnknownTypeError
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
-from t3mpc_ros.bag.recorded_losses import LOSSES, message_loss_record
 from t3mpc_ros.bag.recorder_parameters import RecordingParameters
-from t3mpc_ros.bag.recording_metadata import SEED_RECORD, RecordingMetadata
+from t3mpc_ros.bag.recording_metadata import (
+    LOSSES,
+    SEED_RECORD,
+    RecordingMetadata,
+    message_loss_record,
+)
 from t3mpc_ros.bag.snapshot_ring_buffer import (
     CircularMessageCache,
     DiagnosticsMonitor,

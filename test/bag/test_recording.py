@@ -30,8 +30,8 @@ from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata_yaml import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recorded_losses import message_loss_notes, message_loss_record
 from t3mpc_ros.bag.recorder_parameters import RecordingParameters
+from t3mpc_ros.bag.recording_metadata import message_loss_notes, message_loss_record
 from t3mpc_ros.bag.snapshot_ring_buffer import (
     REPORT_TIMEOUT_NS,
     CircularMessageCache,

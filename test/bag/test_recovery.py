@@ -41,7 +41,7 @@ from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recorded_losses import lost_spans, message_losses
+from t3mpc_ros.bag.recording_metadata import lost_spans, message_losses
 from t3mpc_ros.bag.recovery import (
     Damage,
     FileResult,

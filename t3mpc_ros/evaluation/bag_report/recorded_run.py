@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.errors import DataError
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
-from t3mpc_ros.bag.recorded_losses import lost_spans
+from t3mpc_ros.bag.recording_metadata import lost_spans
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history
 from t3mpc_ros.evaluation.bag_report.motion_continuity import (

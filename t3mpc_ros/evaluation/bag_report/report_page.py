@@ -22,7 +22,7 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recorded_losses import LOSS_CAUSES, UNDISCOVERED, message_losses
+from t3mpc_ros.bag.recording_metadata import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.evaluation.bag_report import incidents
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (

@@ -22,7 +22,7 @@ import numpy as np
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recorded_losses import is_loss_record
+from t3mpc_ros.bag.recording_metadata import is_loss_record
 from t3mpc_ros.evaluation.bag_report import report_charts
 from t3mpc_ros.evaluation.bag_report.incidents import driving
 from t3mpc_ros.evaluation.bag_report.metrics import (

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.bag.columns import TopicColumns, read_columns
 from t3mpc_ros.bag.controller_input_journal import COMMAND_EVENTS, Event, parameters_from_json
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recorded_losses import message_loss_notes
+from t3mpc_ros.bag.recording_metadata import message_loss_notes
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
 from t3mpc_ros.evaluation import topic_roles
 from t3mpc_ros.evaluation.topic_roles import COMMAND, JOURNAL, ODOMETRY, REFERENCE
