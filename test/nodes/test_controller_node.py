@@ -91,9 +91,7 @@ def test_the_map_of_the_keep_out_is_in_the_frame_of_odom(harness, tmp_path):
     )
     assert grid.cells[row, column] == 0
     assert grid.cells[0, 0] == -1
-    response = harness.call(Trigger, 'controller/save_map')
-    assert response.success
-    assert file in response.message
+    assert file in harness.done(Trigger, 'controller/save_map')
     assert (load_map(file).cells == 100).any()
     # Another one begins with its obstacles, and looks at the floor again.
     other = harness.add(
@@ -175,7 +173,7 @@ def test_enable_and_disable(harness):
     bench.publish_odometry()
     bench.publish_reference(seconds=0.5)
     for enabled in (True, False, True):
-        assert harness.call(SetBool, 'controller/enable', data=enabled).success
+        harness.done(SetBool, 'controller/enable', data=enabled)
         bench.run(5)
         found = diagnostic_level(bench.controller), reason(bench.controller)
         disabled = ERROR, 'stopped: disabled by request'
@@ -207,9 +205,7 @@ def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
     )
 
     def saved():
-        response = harness.call(Trigger, 'controller/save_model')
-        assert response.success
-        assert str(tmp_path / 'model.npz') in response.message
+        assert str(tmp_path / 'model.npz') in harness.done(Trigger, 'controller/save_model')
         return load_model(tmp_path / 'model.npz')
 
     initial = saved()
@@ -228,13 +224,13 @@ def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
         model=files['model'],
         model_output=files['copy'],
     )
-    assert harness.call(Trigger, 'copy/controller/save_model').success
+    harness.done(Trigger, 'copy/controller/save_model')
     loaded = load_model(tmp_path / 'copy.npz')
     assert loaded.keys() == learnt.keys()
     for name in learnt:
         np.testing.assert_array_equal(loaded[name], learnt[name])
 
-    assert harness.call(Trigger, 'controller/reset').success
+    harness.done(Trigger, 'controller/reset')
     for name, value in saved().items():
         np.testing.assert_array_equal(value, initial[name])
     bench.publish_odometry()
@@ -243,16 +239,14 @@ def test_weights_survive_in_a_model_file_and_not_a_reset(harness, tmp_path):
 
 def test_an_unusable_model_file_is_named(harness, tmp_path):
     harness.add(ControllerNode, model_output=str(tmp_path / 'no' / 'folder.npz'))
-    response = harness.call(Trigger, 'controller/save_model')
-    assert not response.success
-    assert 'no/folder.npz' in response.message
+    assert 'no/folder.npz' in harness.refused(Trigger, 'controller/save_model')
     small = harness.add(
         ControllerNode,
         namespace='small',
         fuzzy__sets=5,
         model_output=str(tmp_path / 'small.npz'),
     )
-    assert harness.call(Trigger, 'small/controller/save_model').success
+    harness.done(Trigger, 'small/controller/save_model')
     harness.remove(small)
     with pytest.raises(ModelError, match=r'small.npz does not fit the parameters'):
         harness.add(ControllerNode, namespace='other', model=str(tmp_path / 'small.npz'))

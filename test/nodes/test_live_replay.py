@@ -85,14 +85,14 @@ def eventful_run(harness, bag, model, late):
         count = 2 if topic == 'cmd_vel' else 1  # the harness subscribes, too
         harness.spin_until(lambda t=topic, n=count: controller.count_subscribers(t) >= n, topic)
     drive(bench, 100)
-    assert harness.call(Trigger, 'controller/reset').success
+    harness.done(Trigger, 'controller/reset')
     drive(bench, 50)
     drive(bench, 200, mean=0.3, linear=0.0)
     for name, value in (('law.gain', 90.0), ('linear.x.max_velocity', 0.12)):
         assert controller.set_parameters([Parameter(name, value=value)])[0].successful
         drive(bench, 50)
     for enabled in (False, True):
-        assert harness.call(SetBool, 'controller/enable', data=enabled).success
+        harness.done(SetBool, 'controller/enable', data=enabled)
         drive(bench, 30)
     harness.spin_until(lambda: reason(controller) == 'stopped: no odometry')
     drive(bench, 100)

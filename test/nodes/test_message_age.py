@@ -68,8 +68,7 @@ def test_a_command_that_waited_does_not_move_sim_robot(harness, simulated_time):
     assert max(map(speed, odom)) < 1e-3
     assert diagnostic(robot, 'commands_rejected') == 1
     assert 'command is too old' in reason(robot)
-    source = CommandSource(harness)
-    source.message = twist(0.3)
+    CommandSource(harness, twist(0.3))
     harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'a new command moves the robot')
 
 

@@ -89,8 +89,7 @@ def driving(harness, plug, linear=0.1):
     """Return the node, the command source and the received odometry, once the robot drives."""
     node = harness.add(RadioBridgeNode, port=plug.path)
     odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(linear)
+    source = CommandSource(harness, twist(linear))
     harness.spin_until(
         lambda: odom and odom[-1].twist.twist.linear.x > 0.9 * linear, 'the robot drives'
     )
@@ -130,12 +129,12 @@ def test_timeout_and_e_stop_stop_the_robot(harness, plug):
         lambda: reason(node).startswith('no command for 0.25 s'), 'the reason in the diagnostics'
     )
     harness.spin_until(lambda: plug.robot.speeds == (0.0, 0.0), 'standstill')
-    assert harness.call(SetBool, 'e_stop', data=True).success
+    harness.done(SetBool, 'e_stop', data=True)
     source.message = twist(0.1)
     harness.spin_until(lambda: plug.robot.estop, 'the stop')
     assert 'emergency stop: requested by service e_stop' in reason(node)
     assert plug.robot.speeds == (0.0, 0.0)
-    assert harness.call(SetBool, 'e_stop', data=False).success
+    harness.done(SetBool, 'e_stop', data=False)
     harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives again')
 
 
@@ -163,8 +162,7 @@ def test_commands_are_signed_with_the_key(harness, tmp_path):
     path.chmod(0o600)
     with closing(Plug(tmp_path / 'dongle', key)) as plug:
         node = harness.add(RadioBridgeNode, port=plug.path, key_file=str(path))
-        source = CommandSource(harness)
-        source.message = twist(0.1)
+        CommandSource(harness, twist(0.1))
         harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives')
         harness.spin_until(lambda: reason(node) == 'following commands', 'status OK')
         assert diagnostic(node, 'authenticated') is True

@@ -151,8 +151,7 @@ def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, processes, tmp_path)
 def test_a_replugged_dongle_drives_within_a_second(harness, served):
     board = served(dongle_boot_time=0.0)
     node = harness.add(RadioBridgeNode, port=board.path)
-    source = CommandSource(harness)
-    source.message = twist(0.1)
+    CommandSource(harness, twist(0.1))
     harness.spin_until(
         lambda: board.followed and board.followed[-1][1].left > 2000, 'the robot drives'
     )
@@ -193,8 +192,7 @@ def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):
     """The other process ignores the lock, reads responses, writes noise and frames of its own."""
     board = served()
     node = harness.add(RadioBridgeNode, port=board.path)
-    source = CommandSource(harness)
-    source.message = twist(0.1)
+    CommandSource(harness, twist(0.1))
     harness.spin_until(lambda: len(board.followed) > 20, 'the robot drives')
     foreign_node = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     dice = random.Random(4)

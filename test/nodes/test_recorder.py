@@ -33,6 +33,7 @@ from support.ros_graph import (
     odometry,
     reason,
     record,
+    recorded,
     twist,
 )
 from support.waiting import wait_for_acknowledgement
@@ -78,8 +79,7 @@ def files(path):
 
 def test_reception_is_stamped_on_arrival_not_on_taking(harness, tmp_path):
     recorder = record(harness, tmp_path, 'text')
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(text)
+    text = harness.connected_publisher(String, 'text')
     sent = []
     for number in range(5):
         sent.append(time.time_ns())
@@ -87,8 +87,7 @@ def test_reception_is_stamped_on_arrival_not_on_taking(harness, tmp_path):
         time.sleep(0.1)  # no executor spins
     taken = time.time_ns()
     harness.spin_until(lambda: values(recorder)['messages'] == 5)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
+    with recorded(harness, recorder) as recording:
         stamps = [recording.start_ns + round(at * 1e9) for at, _ in recording.messages('/text')]
     for before, received, after in zip(sent, stamps, [*sent[1:], taken], strict=True):
         assert before - 1_000 <= received < after
@@ -118,8 +117,7 @@ def test_messages_beyond_the_queue_are_dropped_and_counted(harness, logged, tmp_
     harness.spin_until(lambda: diagnostic_level(recorder) == WARN)
     text.publish(String(data='again'))
     harness.spin_until(lambda: values(recorder)['messages'] == 801)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
+    with recorded(harness, recorder) as recording:
         lost = recording.metadata_records['losses']
         counts = {name: topic.message_count for name, topic in recording.topics.items()}
     assert counts['/text'] + int(lost['dropped /text']) == 401
@@ -131,8 +129,7 @@ def test_messages_beyond_the_queue_are_dropped_and_counted(harness, logged, tmp_
 def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
     """A full KEEP_LAST queue replaces its oldest samples, which DDS does not count as lost."""
     recorder = record(harness, tmp_path, 'text', storage__chunk_duration=0.05)
-    text = harness.create_publisher(String, 'text', DEEP)
-    harness.wait_for_subscriber(text)
+    text = harness.connected_publisher(String, 'text', DEEP)
     text.publish(String(data='first'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
     for i in range(1500):  # no executor spins; the queue holds 1000 messages
@@ -192,8 +189,7 @@ def test_expressions_and_types_select_in_the_graph(harness, tmp_path):
     for publisher in counts.values():
         publisher.publish(Int32(data=1))
     harness.spin_until(lambda: values(recorder)['messages'] == 2)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
+    with recorded(harness, recorder) as recording:
         assert sorted(recording.topics) == ['/cam_1', '/count']
 
 
@@ -209,8 +205,7 @@ def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path)
     harness.wait_for_subscriber(journal)
     journal.publish(Int64MultiArray(data=[5]))
     harness.spin_until(lambda: values(recorder)['messages'] == 6)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
+    with recorded(harness, recorder) as recording:
         numbers = recording.series('/controller/journal', {'n': 'data[0]'})['n']
     assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
 
@@ -284,33 +279,29 @@ def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
         harness, tmp_path, 'text', storage__snapshot_mode=True, storage__snapshot_duration=60.0
     )
     assert harness.call(Trigger, 'recorder/split_bagfile').success is False
-    response = harness.call(Trigger, 'recorder/snapshot')
-    assert not response.success
-    assert 'no message was received' in response.message
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(text)
+    assert 'no message was received' in harness.refused(Trigger, 'recorder/snapshot')
+    text = harness.connected_publisher(String, 'text')
     text.publish(String(data='kept'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
     assert list(tmp_path.glob('*')) == []
-    assert harness.call(Trigger, 'recorder/snapshot').success
+    harness.done(Trigger, 'recorder/snapshot')
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     assert list(tmp_path.glob('*.mcap')) == []
     assert texts(snapshots(tmp_path)[0]) == ['kept']
     assert diagnostic_level(recorder) == OK
     record(harness, tmp_path / 'off', 'text', namespace='off', storage__snapshot_duration=0.0)
-    response = harness.call(Trigger, 'off/recorder/snapshot')
-    assert not response.success
-    assert 'storage.snapshot_duration must be above 0' in response.message
+    assert 'storage.snapshot_duration must be above 0' in harness.refused(
+        Trigger, 'off/recorder/snapshot'
+    )
 
 
 def test_a_failed_snapshot_is_reported_and_recording_continues(harness, logged, tmp_path):
     (tmp_path / 'snapshots').write_text('a file where a folder is wanted')
     recorder = record(harness, tmp_path, 'text')
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(text)
+    text = harness.connected_publisher(String, 'text')
     text.publish(String(data='one'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
-    assert harness.call(Trigger, 'recorder/snapshot').success
+    harness.done(Trigger, 'recorder/snapshot')
     harness.spin_until(lambda: diagnostic_level(recorder) == WARN)
     text.publish(String(data='two'))
     harness.spin_until(lambda: values(recorder)['messages'] == 2)
@@ -343,7 +334,7 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     )
     response = harness.call(Trigger, 'recorder/split_bagfile')
     assert (response.success, response.message) == (True, 'continues in bag_1.mcap')
-    assert harness.call(Trigger, 'controller/save_model').success
+    harness.done(Trigger, 'controller/save_model')
     harness.remove(recorder)
     one, two = sorted(bag.glob('*.mcap'))
     assert files(one) == {
@@ -382,8 +373,7 @@ def test_parameters_of_a_restarted_node_are_recorded_again(harness, tmp_path):
     harness.spin_until(lambda: '/sim_robot' not in recorder._parameter_watch.nodes)
     harness.add(SimRobotNode, seed=4)
     harness.spin_until(lambda: recorder._metadata.records['sim_robot']['seed'] == '4')
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
+    with recorded(harness, recorder) as recording:
         assert recording.metadata_records['sim_robot']['seed'] == '4'
 
 
@@ -418,7 +408,7 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
         lambda: {SEED_RECORD, 'reference_generator'} <= recorder._metadata.records.keys()
     )
     first = recorder._metadata.records[SEED_RECORD]['reference_generator']
-    assert harness.call(Trigger, 'reference_generator/reseed').success
+    harness.done(Trigger, 'reference_generator/reseed')
     seeds.append(reference._seed)
     harness.spin_until(
         lambda: recorder._metadata.records[SEED_RECORD]['reference_generator'] != first
@@ -449,9 +439,8 @@ def test_secret_seed_excludes_a_given_seed(harness):
 def test_an_e_stop_of_the_own_robot_starts_a_snapshot(harness, tmp_path):
     recorder = record(harness, tmp_path, 'odom', 'cmd_vel', namespace='a')
     robots = [harness.add(SimRobotNode, namespace=name) for name in ('a', 'b')]
-    drivers = [CommandSource(harness, f'{name}/cmd_vel') for name in ('a', 'b')]
-    for source in drivers:
-        source.message = twist(0.1)
+    for name in ('a', 'b'):
+        CommandSource(harness, twist(0.1), f'{name}/cmd_vel')
     for name in ('a', 'b'):
         harness.spin_until(
             lambda name=name: any(s.level == OK for s in harness.statuses(f'{name}/sim_robot'))
@@ -493,8 +482,7 @@ def test_the_calibration_is_in_the_bag(harness, tmp_path, capsys):
     harness.add(RadioBridgeNode, port=str(tmp_path / 'none'), **values['radio_bridge'])
     harness.add(ControllerNode, **values['controller'])
     harness.spin_until(lambda: {'radio_bridge', 'controller'} <= set(recorder._metadata.records))
-    harness.remove(recorder)
-    with open_bag(tmp_path / 'bag') as recording:
+    with recorded(harness, recorder) as recording:
         bridge = recording.metadata_records['radio_bridge']
         controller = recording.metadata_records['controller']
     assert float(bridge['wheel_radius']) == float(controller['wheel_radius']) == 0.0356

@@ -121,7 +121,7 @@ def test_a_pause_and_its_end_are_ramps(harness, source):
     first = len(received)
     for on, condition in ((True, lambda v: v == 0.0), (False, lambda v: v > 0.1)):
         for _ in range(2):
-            assert harness.call(SetBool, 'reference_generator/pause', data=on).success
+            harness.done(SetBool, 'reference_generator/pause', data=on)
         harness.spin_until(reached(condition))
         if on:
             held, count = received[-1].pose.pose, len(received)

@@ -90,7 +90,7 @@ def test_e_stop_latches_and_release_needs_a_new_command(harness):
     robot, odom, source = driving_robot(harness, 0.3)
     foreign = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
     harness.spin_until(lambda: 'TwistStamped' in reason(robot))
-    assert harness.call(SetBool, 'e_stop', data=True).success
+    harness.done(SetBool, 'e_stop', data=True)
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
     status = harness.next_status('sim_robot')  # no mismatch of types hides the stop
     foreign.destroy()
@@ -104,32 +104,27 @@ def test_e_stop_latches_and_release_needs_a_new_command(harness):
     source.message = None
     count = diagnostic(robot, 'commands_rejected')
     assert count > 0
-    assert harness.call(SetBool, 'e_stop', data=False).success
+    harness.done(SetBool, 'e_stop', data=False)
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 20)
     assert max(map(speed, odom[count:])) < 1e-3, 'the old command stays invalid'
     harness.spin_until(lambda: 'released' in reason(robot))
     source.message = twist(0.3)
     harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'a new command moves the robot')
-    response = harness.call(SetBool, 'e_stop', data=False)
-    assert not response.success
-    assert 'no emergency stop' in response.message
+    assert 'no emergency stop' in harness.refused(SetBool, 'e_stop', data=False)
 
 
 def test_odometry_is_reset_at_rest_only(harness):
     harness.add(SimRobotNode)
     odom = harness.subscribe(Odometry, 'odom')
     truth = harness.subscribe(Odometry, 'ground_truth/odom')
-    source = CommandSource(harness)
-    source.message = twist(0.3)
+    source = CommandSource(harness, twist(0.3))
     harness.spin_until(lambda: odom and odom[-1].pose.pose.position.x > 0.05)
-    response = harness.call(Trigger, 'reset_odometry')
-    assert not response.success
-    assert 'moves' in response.message
+    assert 'moves' in harness.refused(Trigger, 'reset_odometry')
     assert odom[-1].pose.pose.position.x > 0.05
     source.message = None
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
-    assert harness.call(Trigger, 'reset_odometry').success
+    harness.done(Trigger, 'reset_odometry')
     harness.spin_until(lambda: abs(odom[-1].pose.pose.position.x) < 1e-3)
     harness.spin_until(lambda: truth[-1].pose.pose.position.x > 0.05, 'the true pose is unchanged')
 
@@ -146,8 +141,7 @@ def test_odometry_has_an_exact_grid_frames_and_joints(harness):
     )
     odom = harness.subscribe(Odometry, 'odom')
     joints = harness.subscribe(JointState, 'joint_states')
-    source = CommandSource(harness)
-    source.message = twist(0.2, 1.0)
+    CommandSource(harness, twist(0.2, 1.0))
     harness.spin_until(lambda: len(odom) > 40 and len(joints) > 10)
     assert on_grid(odom, 50)
     assert odom[-1].header.frame_id == 'a/odom'

@@ -114,7 +114,7 @@ def test_sensor_messages_match_the_state_at_their_rates(harness):
     topics = 'imu/data_raw', 'battery_state', *(f'range/{name}' for name in RANGE_SENSORS)
     wait_for_subscribers(harness, robot, *topics)
     for step in range(1, 6):
-        assert harness.call(Trigger, 'sim_robot/step').success
+        harness.done(Trigger, 'sim_robot/step')
         harness.spin_until(lambda count=50 * step: len(imu) >= count)
     harness.spin_until(lambda: len(battery) > 2 and all(len(x) > 60 for x in received.values()))
 
@@ -185,8 +185,7 @@ def test_a_dead_gyro_is_a_warning_until_it_recovers(harness):
     robot = harness.add(SimRobotNode)
     imu = harness.subscribe(Imu, 'imu/data_raw')
     odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(0.1)
+    CommandSource(harness, twist(0.1))
     harness.spin_until(
         lambda: imu and (diagnostic_level(robot), reason(robot)) == (OK, 'following commands')
     )
@@ -291,9 +290,7 @@ def test_paused_time_advances_by_steps_only(harness):
 
     assert change(harness, robot, real_time_factor=1.0)[0].successful
     harness.spin_until(lambda: len(states) > 30, 'the time advances')
-    response = harness.call(Trigger, 'sim_robot/step')
-    assert not response.success
-    assert 'real_time_factor must be 0' in response.message
+    assert 'real_time_factor must be 0' in harness.refused(Trigger, 'sim_robot/step')
     assert change(harness, robot, real_time_factor=0.0)[0].successful
     held = ros_messages.time_from_ns(states[-1].stamp_ns)
     harness.spin_until(lambda: clock[-1].clock == held, 'the held time is published')
@@ -305,9 +302,7 @@ def test_paused_time_advances_by_steps_only(harness):
 
 def test_simulated_time_needs_publish_clock(harness):
     robot = harness.add(SimRobotNode)
-    response = harness.call(Trigger, 'sim_robot/step')
-    assert not response.success
-    assert 'publish_clock must be true' in response.message
+    assert 'publish_clock must be true' in harness.refused(Trigger, 'sim_robot/step')
     (result,) = change(harness, robot, real_time_factor=2.0)
     assert not result.successful
     assert 'publish_clock must be true' in result.reason
@@ -333,13 +328,12 @@ def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
             for topic, kind in kinds.items()
         }
         wait_for_subscribers(harness, robot, *kinds)
-        commands = harness.create_publisher(Twist, f'{name}/cmd_vel')
-        harness.wait_for_subscriber(commands)
+        commands = harness.connected_publisher(Twist, f'{name}/cmd_vel')
         states = published_states(robot)
         for n in range(8):
             commands.publish(twist(0.05 * n, 0.3 * n))
             harness.spin_until(lambda one=robot, count=n + 1: diagnostic(one, 'commands') == count)
-            assert harness.call(Trigger, f'{name}/sim_robot/step').success
+            harness.done(Trigger, f'{name}/sim_robot/step')
         end_ns = states[-1].stamp_ns
         for topic in ('odom', 'imu/data_raw'):
             harness.spin_until(lambda some=received[topic], end=end_ns: stamp(some[-1]) == end)
@@ -411,8 +405,7 @@ def test_two_robots_launch_file_separates_the_robots(harness):
     assert one.parameters.seed != two.parameters.seed
     states = {name: published_states(robot) for name, robot in robots.items()}
     imu = {name: harness.subscribe(Imu, f'{name}/imu/data_raw') for name in robots}
-    source = CommandSource(harness, 'robot_1/cmd_vel')
-    source.message = twist(0.2)
+    CommandSource(harness, twist(0.2), 'robot_1/cmd_vel')
     harness.spin_until(lambda: states['robot_1'] and states['robot_1'][-1].truth.pose.x > -0.4)
     assert states['robot_2'][-1].truth.pose == pytest.approx(two.parameters.pose, abs=1e-4)
     assert change(harness, two, faults__gyro_dead=True)[0].successful

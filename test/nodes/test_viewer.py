@@ -100,8 +100,7 @@ def viewer(robot, harness):
 
 
 def test_a_moving_robot_is_shown(viewer, harness):
-    source = CommandSource(harness)
-    source.message = twist(0.14)
+    source = CommandSource(harness, twist(0.14))
 
     def moving():
         streams = viewer.changes().get('streams', {})

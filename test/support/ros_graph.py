@@ -14,6 +14,7 @@
 """Harness for node tests: nodes of the package and a probe node in one executor over real DDS."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
@@ -26,6 +27,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from support.waiting import wait_until
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import ros_messages
 from t3mpc_ros.nodes.base_node import OK
@@ -150,6 +152,18 @@ class NodeHarness:
         self.probe.destroy_client(client)
         return future.result()
 
+    def done(self, service_type, name, **request):
+        """Return what a service has done; fail if it was refused."""
+        response = self.call(service_type, name, **request)
+        assert response.success, response.message
+        return response.message
+
+    def refused(self, service_type, name, **request):
+        """Return why a service was refused; fail if it was not."""
+        response = self.call(service_type, name, **request)
+        assert not response.success, response.message
+        return response.message
+
     def statuses(self, name):
         """Return the diagnostic statuses of one node so far."""
         return [
@@ -177,18 +191,17 @@ class NodeHarness:
 class CommandSource:
     """Publishes one command periodically, as a teleoperation node does."""
 
-    def __init__(self, harness, topic='cmd_vel', message_type=Twist):
-        self.message = None
-        self.publisher = harness.create_publisher(message_type, topic)
-        harness.publish_periodically(self.publisher, lambda: self.message)
+    def __init__(self, harness, message=None, topic='cmd_vel'):
+        self.message = message
+        publisher = harness.create_publisher(Twist, topic)
+        harness.publish_periodically(publisher, lambda: self.message)
 
 
 def driving_robot(harness, linear):
     """Return a simulated robot, its odometry and the source of its commands, once it drives."""
     robot = harness.add(SimRobotNode)
     odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    source.message = twist(linear)
+    source = CommandSource(harness, twist(linear))
     harness.spin_until(lambda: odom and speed(odom[-1]) > 0.9 * linear, 'the robot drives')
     return robot, odom, source
 
@@ -197,6 +210,14 @@ def record(harness, folder, *topics, **parameters):
     """Return a recorder of some topics."""
     parameters |= {'storage__uri': str(folder), 'record__topics': list(topics)}
     return harness.add(RecorderNode, **parameters)
+
+
+@contextmanager
+def recorded(harness, recorder):
+    """End a recorder and yield its bag."""
+    harness.remove(recorder)
+    with open_bag(recorder.parameters.uri) as recording:
+        yield recording
 
 
 class ControllerHarness:
