@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
-import math
 from typing import Generic, NamedTuple, Self, TypeVar
 
 from t3mpc_ros.bag.errors import BagError
@@ -195,11 +194,6 @@ def loop_duration_ns(begin_ns: int, end_ns: int) -> int:
     return max(end_ns - begin_ns, MIN_LOOP_NS)
 
 
-def alignment_offsets_ns(bags: Sequence[BagReader]) -> list[int]:
-    """Return the offsets that make all bags begin with the first one."""
-    return [bags[0].start_ns - bag.start_ns if bag.message_count else 0 for bag in bags]
-
-
 # -- parameters -----------------------------------------------------------------------------------
 
 
@@ -320,9 +314,10 @@ class PlaybackParameters(Parameters):
                     raise ParameterError(f'storage.uris must name each bag once: got {path} twice')
             offsets_ns = [round(offset * NANOSECONDS) for offset in self.bag_offsets]
             offsets_ns = offsets_ns or [0] * len(bags)
-            if self.align_bags and bags:
+            if self.align_bags:
                 offsets_ns = [
-                    a + b for a, b in zip(alignment_offsets_ns(bags), offsets_ns, strict=True)
+                    bags[0].start_ns - bag.start_ns + offset if bag.message_count else offset
+                    for bag, offset in zip(bags, offsets_ns, strict=True)
                 ]
             reader = MergedReader(bags, offsets_ns, self.topic_filter())
         except Exception:
@@ -391,8 +386,7 @@ class PlaybackTimeline:
         self._loop_ns = loop_duration_ns(begin_ns, end_ns) if loop else 0
         self._tick_ns = round(NANOSECONDS / clock_rate) if clock_rate else 0
         self._next_tick_ns: int | None = None
-        self._ratio = _rate_ratio(rate)
-        self.rate = rate
+        self.rate, self._ratio = rate, rate.as_integer_ratio()
         self.paused = paused
         self.finished = False
         self._steps = 0
@@ -496,9 +490,8 @@ class PlaybackTimeline:
 
     def set_rate(self, now_ns: int, rate: float) -> None:
         """Change the rate, a positive number."""
-        ratio = _rate_ratio(rate)
         self._bind(now_ns)
-        self.rate, self._ratio = rate, ratio
+        self.rate, self._ratio = rate, rate.as_integer_ratio()
 
     def seek(self, now_ns: int, stamp_ns: int) -> str:
         """Continue at a bag time, transient-local messages before it first; return the problem."""
@@ -520,8 +513,6 @@ class PlaybackTimeline:
             return 'the player must be paused to play the next message'
         if self.finished:
             return 'there is no next message'
-        if count < 1:
-            return f'the number of messages must be at least 1: got {count}'
         self._steps += count
         return ''
 
@@ -598,9 +589,3 @@ def velocity_command_risk(recorded: str, name: str, type_name: str) -> str:
     if type_name in VELOCITY_TYPES and name == recorded:
         return f'{name} is a velocity ({type_name}) and may drive a robot'
     return ''
-
-
-def _rate_ratio(rate: float) -> tuple[int, int]:
-    if not (math.isfinite(rate) and rate > 0.0):
-        raise ValueError(f'rate must be a positive number: got {rate}')
-    return float(rate).as_integer_ratio()
