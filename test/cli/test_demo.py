@@ -67,18 +67,10 @@ while True:
 
 
 def stand_ins(folder, silent=(), ignored=(), ends=None):
-    """Return the environment of a demo whose nodes are stand-ins.
+    """Return the environment of a demo whose nodes are stand-ins in ``folder``.
 
-    Parameters
-    ----------
-    folder
-        Folder of the executables and of the files with their process ids.
-    silent
-        Nodes that never print that they are ready or track.
-    ignored
-        Signals that the stand-ins ignore.
-    ends
-        Exit codes, or signals as negative numbers, by node; without it 0.
+    The ``silent`` nodes never print that they are ready or track; ``ignored`` are signals;
+    ``ends`` are exit codes, or signals as negative numbers, by node.
     """
     programs = folder / 'lib' / 't3mpc_ros'
     programs.mkdir(parents=True)

@@ -109,13 +109,7 @@ def _shortened(command):
 
 
 class Walk:
-    """Executes the commands at the ports of one robot.
-
-    Parameters
-    ----------
-    emulator
-        Both boards, with erased EEPROM.
-    """
+    """Executes the commands at the ports of one robot, at first with erased EEPROM."""
 
     def __init__(self, emulator, monkeypatch, capsys):
         self.bench = CalibrationBench(emulator=emulator)

@@ -41,17 +41,9 @@ def pause():
 
 
 def wait_until(condition, problem='', seconds=TIMEOUT, step=pause):
-    """Call ``step`` until ``condition`` holds.
+    """Call ``step`` until ``condition`` holds; after ``seconds`` raise :class:`WaitTimeoutError`.
 
-    Parameters
-    ----------
-    problem
-        What is wrong if it does not, or a function that returns it.
-
-    Raises
-    ------
-    WaitTimeoutError
-        It does not within ``seconds``.
+    ``problem``, its text or a function that returns it, says what is wrong.
     """
     deadline = time.monotonic() + seconds
     while not condition():
