@@ -323,12 +323,14 @@ def test_standstill_against_the_command_is_seen(rows, tmp_path):
 def test_smoothing_keeps_the_speed_and_does_not_bridge_gaps():
     time = np.arange(0.0, 20.0, 0.01)
     speed = np.sin(2.0 * time)
-    at, value = smooth(Series(time, {'a': speed}), 'a')
+    smoothed = smooth(Series(time, {'a': speed}), 'a')
+    at, value = smoothed.time, smoothed['a']
     np.testing.assert_allclose(value, np.sin(2.0 * at), atol=1e-4)
     gap = slice(500, 900)
-    at, value = smooth(Series(np.delete(time, gap), {'a': np.delete(speed, gap)}), 'a')
+    smoothed = smooth(Series(np.delete(time, gap), {'a': np.delete(speed, gap)}), 'a')
+    at, value = smoothed.time, smoothed['a']
     assert np.isnan(value[(at > 5.2) & (at < 8.8)]).all()
-    assert not smooth(Series(time[:2], {'a': speed[:2]}), 'a')[0].size
+    assert not len(smooth(Series(time[:2], {'a': speed[:2]}), 'a'))
 
 
 # -- the link -----------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from support.report_run import RUN
 from t3mpc_ros.evaluation.bag_report.incidents import (
     STALL_PERIODS,
     find_blocked_wheels,
-    find_carried,
     find_incidents,
     find_slips,
     find_stalls,
@@ -46,6 +45,10 @@ def motion(right, left, turned=0.0):
     x, y = (0.01 * np.cumsum(linear * each(yaw)) for each in (np.cos, np.sin))
     values = {'linear': linear, 'angular': angular, 'right': right, 'left': left}
     return Series(TIME, values | {'x': x, 'y': y, 'yaw': yaw})
+
+
+def carried_in(run):
+    return find_incidents(run).carried
 
 
 def moved(series, **changes):
@@ -234,7 +237,7 @@ def test_a_robot_that_is_carried_or_turned_is_found(name, seconds):
     carried = moved(drive, x=drive['x'] + 0.9 * share), 'moves by 0.9'
     turned = motion(*speeds, 1.6 * share), 'turns by 1.'
     for shown, text in (carried, turned) if seconds < 5.0 else (carried,):
-        (found,) = find_carried(replace(run, motions={**motions, name: shown}))
+        (found,) = carried_in(replace(run, motions={**motions, name: shown}))
         assert (found.name, found.against) == (name, 'its twist')
         assert 12.0 <= found.time <= 12.02 + 0.8 * seconds
         assert text in found.text
@@ -243,10 +246,10 @@ def test_a_robot_that_is_carried_or_turned_is_found(name, seconds):
     still = {'linear': 0.0 * TIME, 'angular': 0.0 * TIME}
     both = {**motions, TRUTH: moved(drive, **lifted, **still), ODOMETRY: moved(drive, **still)}
     if 0.01 < seconds < 5.0:  # less is a jump of a robot at rest
-        (found,) = find_carried(replace(run, motions=both))
+        (found,) = carried_in(replace(run, motions=both))
         assert (found.name, found.against) == (TRUTH, ODOMETRY)
     same = {**both, ODOMETRY: both[TRUTH]}
-    assert find_carried(replace(run, motions=same)) == ()
+    assert carried_in(replace(run, motions=same)) == ()
 
 
 def test_noise_outliers_strafing_and_the_localizer_carry_nothing():
@@ -268,10 +271,10 @@ def test_noise_outliers_strafing_and_the_localizer_carry_nothing():
         moved(motion(*noisy), **pose), moved(drive, **outliers), moved(drive, **sideways),
         moved(drive, **no_pose), moved(drive, yaw=0.0 * TIME), slow,
     ):  # fmt: skip
-        assert find_carried(replace(run, motions={**run.motions, ODOMETRY: shown})) == ()
+        assert carried_in(replace(run, motions={**run.motions, ODOMETRY: shown})) == ()
     corrected = {**run.motions, ODOMETRY: moved(drive, x=drive['x'] + 0.9 * (TIME > 9.0))}
-    assert find_carried(replace(run, motions=corrected))
-    assert not find_carried(replace(run, motions=corrected, parameters={'localizer': {}}))
+    assert carried_in(replace(run, motions=corrected))
+    assert not carried_in(replace(run, motions=corrected, parameters={'localizer': {}}))
 
 
 @pytest.mark.parametrize('twist', [0.0, 1.0])
@@ -308,7 +311,7 @@ def test_a_twist_of_the_opposite_sign_is_no_event():
     speeds = wheels(np.random.default_rng(8))
     run = run_of(speeds, speeds)
     wrong = moved(run.motions[ODOMETRY], linear=-run.motions[ODOMETRY]['linear'])
-    (found,) = find_carried(replace(run, motions={ODOMETRY: wrong}))
+    (found,) = carried_in(replace(run, motions={ODOMETRY: wrong}))
     assert 'see signs, units and frames' in found.text
 
 

@@ -158,52 +158,50 @@ class Incidents:
 
     def events(self) -> list[tuple[float, str, str]]:
         """Return time (s), kind and text of all of them."""
-        found = [
-            (stop.start, 'stop', f'for {stop.length:.2f} s: {stop.cause.text}')
-            for stop in self.stops
-        ]
-        found += [
-            (start, 'stall', f'of the machine: the loop pauses for {1e3 * (end - start):.0f} ms')
-            for start, end in self.stalls
-        ]
-        found += [
-            (start, 'gap', f'no {name} for {end - start:.1f} s')
-            for start, end, name in (*self.gaps, *self.ended)
-        ]
-        found += [
-            (start, 'stop', f'of the {title}, for {end - start:.2f} s, although commanded to turn')
-            for start, end, title in self.blocked
-        ]
-        found += [
-            (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
-            for jump in self.jumps
-        ]
-        found += [(start, 'gap', text) for start, _, text in self.frozen]
-        found += [(each.time, 'jump', each.text) for each in self.carried]
         slips = 'a wheel slips, is blocked, or has lost steps'
-        found += [(start, 'slip', f'for {end - start:.1f} s {slips}') for start, end in self.slips]
+        found = [
+            *((e.start, 'stop', f'for {e.length:.2f} s: {e.cause.text}') for e in self.stops),
+            *(
+                (low, 'stall', f'of the machine: the loop pauses for {1e3 * (high - low):.0f} ms')
+                for low, high in self.stalls
+            ),
+            *(
+                (low, 'gap', f'no {name} for {high - low:.1f} s')
+                for low, high, name in (*self.gaps, *self.ended)
+            ),
+            *(
+                (
+                    low,
+                    'stop',
+                    f'of the {title}, for {high - low:.2f} s, although commanded to turn',
+                )
+                for low, high, title in self.blocked
+            ),
+            *(
+                (e.time, 'jump', f'of the position of {e.name}, by {e.distance:.4g} m')
+                for e in self.jumps
+            ),
+            *((start, 'gap', text) for start, _, text in self.frozen),
+            *((each.time, 'jump', each.text) for each in self.carried),
+            *((low, 'slip', f'for {high - low:.1f} s {slips}') for low, high in self.slips),
+        ]
         return sorted(found)
 
 
 def find_incidents(run: Run) -> Incidents:
     """Return what interrupted a run."""
     first, last = driving(run)
+    torn = [(*gap, name) for name, each in run.motions.items() for gap in gaps(each.time)]
+    frozen, jumps = find_frozen(run), find_jumps(run)
     return Incidents(
         find_stops(run),
         tuple(span for span in find_stalls(run) if first <= span[0] and span[1] <= last),
-        tuple(
-            sorted(
-                (low, high, name)
-                for name in (REFERENCE, ODOMETRY, TRUTH, COMMAND)
-                if name in run.motions
-                for low, high in gaps(run.motions[name].time)
-            )
-        ),
+        tuple(sorted(torn)),
         find_ends(run),
         find_blocked_wheels(run),
-        find_frozen(run),
-        find_jumps(run),
-        find_carried(run),
+        frozen,
+        jumps,
+        find_carried(run, frozen, jumps),
         find_slips(run),
     )
 
@@ -236,48 +234,45 @@ def find_ends(run: Run) -> tuple[tuple[float, float, str], ...]:
     return tuple(sorted(found))
 
 
-def smooth(series: Series, name: str) -> tuple[Array, Array]:
-    """Return evenly spaced times with the smoothed speed.
+def smooth(series: Series, *names: str) -> Series:
+    """Return smoothed quantities at evenly spaced times; none of a series that is too short.
 
     Parabolas are fitted to windows of :data:`WINDOW` or of eight samples, whichever is longer.
-    Empty arrays when the series is too short; NaN across gaps longer than a window.
+    NaN across gaps longer than a window.
     """
-    nothing = np.empty(0)
+    nothing = Series(np.empty(0), dict.fromkeys(names, np.empty(0)))
     if len(series) < 3:
-        return nothing, nothing
+        return nothing
     width = max(WINDOW, 8.0 * float(np.median(np.diff(series.time))))
     half = 10
     step = 0.5 * width / half
     count = int((series.time[-1] - series.time[0]) / step) + 1
     if not 2 * half + 1 <= count <= 20_000_000:
-        return nothing, nothing
+        return nothing
     grid = series.time[0] + step * np.arange(count)
-    value = np.interp(grid, series.time, series[name])
     offsets = step * np.arange(-half, half + 1.0)
     design = np.stack([np.ones_like(offsets), offsets, 0.5 * offsets**2], axis=1)
-    fitted = np.correlate(value, np.linalg.pinv(design)[0], 'valid')
+    weights = np.linalg.pinv(design)[0]
     time = grid[half : count - half]
     following = np.clip(np.searchsorted(series.time, time, 'right'), 1, len(series) - 1)
     torn = np.diff(series.time)[following - 1] > width
-    return time, np.where(torn, np.nan, fitted)
+    values = {}
+    for name in names:
+        fitted = np.correlate(np.interp(grid, series.time, series[name]), weights, 'valid')
+        values[name] = np.where(torn, np.nan, fitted)
+    return Series(time, values)
 
 
-def still_rows(linear: Array, angular: Array, factor: float = 1.0) -> NDArray[np.bool_]:
-    """Return where smoothed speeds (m/s, rad/s) are below ``factor`` times :data:`STILL`."""
-    still: NDArray[np.bool_] = (
-        np.isfinite(linear)
-        & (np.abs(linear) < factor * STILL['linear'])
-        & (np.abs(angular) < factor * STILL['angular'])
-    )
-    return still
+def still_rows(speeds: Series, factor: float = 1.0) -> NDArray[np.bool_]:
+    """Return where all smoothed speeds are known and below ``factor`` times :data:`STILL`."""
+    below = [np.abs(speeds[name]) < factor * least for name, least in STILL.items()]
+    return np.asarray(np.all(below, axis=0))
 
 
 def exceeds(speeds: Series | Mapping[str, Array], factor: float) -> NDArray[np.bool_]:
     """Return where a speed exceeds ``factor`` times :data:`STILL`."""
-    found: NDArray[np.bool_] = np.any(
-        [np.abs(speeds[name]) > factor * least for name, least in STILL.items()], axis=0
-    )
-    return found
+    above = [np.abs(speeds[name]) > factor * least for name, least in STILL.items()]
+    return np.asarray(np.any(above, axis=0))
 
 
 def find_slips(run: Run) -> tuple[Span, ...]:
@@ -296,11 +291,10 @@ def find_slips(run: Run) -> tuple[Span, ...]:
 
 def standstills(motion: Series) -> list[Span]:
     """Return start and end of each time in which a robot stood, however short, s."""
-    time, linear = smooth(motion, 'linear')
-    _, angular = smooth(motion, 'angular')
-    still = still_rows(linear, angular)
+    smoothed = smooth(motion, *STILL)
+    time, still = smoothed.time, still_rows(smoothed)
     found = []
-    for each in spans_of(still_rows(linear, angular, HOLD)):
+    for each in spans_of(still_rows(smoothed, HOLD)):
         if np.mean(still[each]) >= 0.5:
             # A robot that creeps before and after it does not stand.
             balance = np.cumsum(np.where(still[each], 1, -1))
@@ -431,14 +425,12 @@ def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
     if motion is None or command is None or run.geometry is None:
         return ()
     found = []
-    speeds = {each.name: smooth(motion, each.name) for each in run.channels}
+    speeds = smooth(motion, *(each.name for each in run.channels))
+    time = speeds.time
     for channel, other in (run.channels, run.channels[::-1]):
-        time, speed = speeds[channel.name]
-        if not time.size:
-            return ()
-        still = np.abs(speed) < WHEEL_STILL
+        still = np.abs(speeds[channel.name]) < WHEEL_STILL
         still &= np.abs(command.held(channel.name, time)) > WHEEL_DEMANDED
-        still &= (time >= command.time[0]) & (np.abs(speeds[other.name][1]) > WHEEL_STILL)
+        still &= (time >= command.time[0]) & (np.abs(speeds[other.name]) > WHEEL_STILL)
         found += [
             (float(time[each][0]), float(time[each][-1]), channel.title)
             for each in spans_of(still)
@@ -516,13 +508,21 @@ def _received(times: Array, low: float, high: float) -> bool:
     return bool(np.any((times > low + edge) & (times < high - edge)))
 
 
+def _poses_measured(run: Run) -> dict[str, Series]:
+    """Return ground truth and odometry where they hold poses that can be trusted."""
+    return {
+        name: motion
+        for name in (TRUTH, ODOMETRY)
+        if (motion := run.motions.get(name)) is not None
+        and 'x' in motion.values
+        and name not in run.untrusted
+    }
+
+
 def find_jumps(run: Run) -> tuple[Jump, ...]:
     """Return where the position of a robot jumps, but for one that cannot be trusted."""
     found = []
-    for name in (ODOMETRY, TRUTH):
-        motion = run.motions.get(name)
-        if motion is None or 'x' not in motion.values or name in run.untrusted:
-            continue
+    for name, motion in _poses_measured(run).items():
         places = np.stack([motion['x'], motion['y']], axis=1)
         found += [
             Jump(float(motion.time[k]), name, away)
@@ -535,10 +535,7 @@ def find_frozen(run: Run) -> tuple[tuple[float, float, str], ...]:
     """Return when an odometry stayed the same although its twist, or ground truth, moved on."""
     found = []
     truth = run.motions.get(TRUTH)
-    for name in (ODOMETRY, TRUTH):
-        motion = run.motions.get(name)
-        if motion is None or 'x' not in motion.values or name in run.untrusted:
-            continue
+    for name, motion in _poses_measured(run).items():
         keys = ('x', 'y', 'yaw', *STILL)
         same = np.all([np.diff(motion[key]) == 0.0 for key in keys], axis=0)
         for rows in spans_of(same):
@@ -564,12 +561,20 @@ def _is_far(distance: float, turn: float) -> bool:
     return distance > DISPLACED or turn > DISPLACED_TURN
 
 
-def find_carried(run: Run) -> tuple[Carried, ...]:
+def find_carried(
+    run: Run, frozen: Sequence[tuple[float, float, str]], jumps: Sequence[Jump]
+) -> tuple[Carried, ...]:
     """Return where a pose moves otherwise than its twist says, or ground truth than odometry.
 
     The localizer of this package corrects the odometry by the map: then it counts for nothing.
     """
-    motions = _with_pose(run)
+    motions = {
+        name: each
+        for name, each in _poses_measured(run).items()
+        if len(each) > 2
+        and np.ptp(each['yaw'])  # else it has no pose
+        and not (name == ODOMETRY and 'localizer' in run.parameters)
+    }
     pairs = [
         (name, 'its twist', each.time, _poses(each, each.time), _moves_by_twist(each))
         for name, each in motions.items()
@@ -580,8 +585,7 @@ def find_carried(run: Run) -> tuple[Carried, ...]:
         odometry = motions[ODOMETRY].between(float(truth.time[0]), float(truth.time[-1]))
         time, moves = odometry.time, _moves_by_pose(odometry)
         pairs.append((TRUTH, ODOMETRY, time, _poses(truth, time), moves))
-    times, found = [jump.time for jump in find_jumps(run)], []
-    frozen = find_frozen(run)
+    times, found = [jump.time for jump in jumps], []
     for name, against, time, poses, moves in pairs:
         for each in displacements(time, poses, moves):
             low, high = each.start - DISPLACED_WINDOW, each.start + each.duration
@@ -591,20 +595,6 @@ def find_carried(run: Run) -> tuple[Carried, ...]:
                 times.append(each.start)
                 found.append(Carried(each.start, name, against, each))
     return tuple(sorted(found))
-
-
-def _with_pose(run: Run) -> dict[str, Series]:
-    """Return ground truth and odometry where they have a pose that is measured."""
-    return {
-        name: motion
-        for name in (TRUTH, ODOMETRY)
-        if (motion := run.motions.get(name)) is not None
-        and len(motion) > 2
-        and 'x' in motion.values
-        and name not in run.untrusted
-        and np.ptp(motion['yaw'])  # else it has no pose
-        and not (name == ODOMETRY and 'localizer' in run.parameters)
-    }
 
 
 def _poses(motion: Series, time: Array | float) -> Array:

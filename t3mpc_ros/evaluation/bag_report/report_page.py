@@ -339,13 +339,13 @@ def motion_rows(run: Run) -> list[list[str]]:
     motion, command = run.motion, run.motions.get(COMMAND)
     if motion is None:
         return []
-    time, linear = incidents.smooth(motion, 'linear')
-    _, angular = incidents.smooth(motion, 'angular')
+    smoothed = incidents.smooth(motion, *incidents.STILL)
+    time, linear, angular = smoothed.time, smoothed['linear'], smoothed['angular']
     known = np.isfinite(linear)
     if not known.any():
         return []
     step = float(time[1] - time[0]) if time.size > 1 else 0.0
-    still = incidents.still_rows(linear, angular)
+    still = incidents.still_rows(smoothed)
     spans = [
         each for each in spans_of(still) if (each.stop - each.start) * step >= incidents.PAUSE
     ]
