@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from support.control_loops import GEOMETRY, PERIOD, ServoLoop, make_state
-from support.golden_bags import ControllerBag, RecordedController
+from support.golden_bags import RecordedController
 from support.long_tests import few_of
 from support.properties import PROPERTY
 from support.velocity_robot import VelocityRobot
@@ -45,7 +45,7 @@ from t3mpc_ros.control.velocity_actuation import (
 )
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
-from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_replay import ControllerBag, replay_controller
 from t3mpc_ros.geometry.kinematics import advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 

@@ -25,11 +25,7 @@ import numpy as np
 import pytest
 from support.bag_files import copied_bag
 from support.bag_messages import START, odometry_message
-from support.golden_bags import (
-    GOLDEN_SCENARIOS,
-    ControllerBag,
-    RecordedController,
-)
+from support.golden_bags import GOLDEN_SCENARIOS, RecordedController
 from support.long_tests import few_of
 from support.other_parameters import with_other_value
 from support.robot_bags import write_with_records
@@ -39,6 +35,7 @@ from t3mpc_ros.bag.controller_input_journal import (
     Event,
     Journal,
     parameters_from_json,
+    parameters_to_json,
 )
 from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.reader import open_bag
@@ -56,7 +53,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     load_inputs,
     match,
 )
-from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_replay import ControllerBag, replay_controller
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     ELSEWHERE,
     Tolerances,
@@ -567,11 +564,12 @@ def one_step(folder, parameters, *, published=True):
     state = State(START, ORIGIN, STANDSTILL)
     with ControllerBag(folder, parameters) as writer:
         if published:
-            writer.parameters(START, 0, parameters.to_dict())
-        writer.motion('reference', START, state)
-        writer.motion('odom', START, state)
-        writer.command(START + 1, STANDSTILL)
-        writer.row(START + 2, Journal().step(START))
+            text = parameters_to_json(0, parameters.to_dict())
+            writer.add('controller/parameters', START, text)
+        writer.add('reference', START, state)
+        writer.add('odom', START, state)
+        writer.add('cmd_vel', START + 1, STANDSTILL)
+        writer.add('controller/journal', START + 2, Journal().step(START))
     return writer.path
 
 

@@ -26,22 +26,18 @@ import zlib
 
 import numpy as np
 
-from t3mpc_ros.bag.controller_input_journal import Journal
+from t3mpc_ros.bag.controller_input_journal import Journal, parameters_to_json
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
     LATER,
-    controller_bag,
-    float_bytes,
-    odometry_bytes,
+    PARAMETERS,
+    ControllerBag,
     output_row,
-    revision_bytes,
-    row_bytes,
-    twist_bytes,
 )
 from t3mpc_ros.evaluation.run_record import RATE
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario, noisy_twin
-from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.topic_roles import COMMAND, JOURNAL, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.model_file import load_model
@@ -50,44 +46,6 @@ from t3mpc_ros.simulation.digital_twin import DigitalTwin
 from t3mpc_ros.simulation.fault_schedule import FaultEvent, FaultSchedule
 
 GOLDEN = Path(__file__).resolve().parents[1] / 'golden'
-
-
-class ControllerBag:
-    """Writes messages into a bag; receive time and publish time are equal."""
-
-    def __init__(self, folder, parameters):
-        self._writer = controller_bag(folder, parameters)
-        self.path = self._writer.path
-
-    def motion(self, topic, now_ns, motion):
-        """Write an odometry message."""
-        self._write(topic, now_ns, odometry_bytes(motion))
-
-    def command(self, now_ns, twist):
-        """Write a command."""
-        self._write(COMMAND, now_ns, twist_bytes(twist))
-
-    def row(self, now_ns, row):
-        """Write a row of the journal."""
-        self._write(f'{CONTROLLER}/journal', now_ns, row_bytes(row))
-
-    def parameters(self, now_ns, revision, values):
-        """Write a revision of the parameters."""
-        self._write(f'{CONTROLLER}/parameters', now_ns, revision_bytes(revision, values))
-
-    def number(self, now_ns, name, value):
-        """Write one scalar of the controller if it is finite."""
-        if math.isfinite(value):
-            self._write(f'{CONTROLLER}/{name}', now_ns, float_bytes(value))
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self._writer.close()
-
-    def _write(self, topic, now_ns, data):
-        self._writer.write(f'/{topic}', now_ns, now_ns, data)
 
 
 class RecordedController:
@@ -103,71 +61,72 @@ class RecordedController:
         self._journal = Journal()
         self.controller = Controller(parameters, obstacles)
         self.controller.warm_up()
-        bag.parameters(now_ns, 0, parameters.to_dict())
+        bag.add(PARAMETERS, now_ns, parameters_to_json(0, parameters.to_dict()))
         if model is not None:
             self.controller.set_weights(load_model(model))
-            bag.row(now_ns, self._journal.model(zlib.crc32(model.read_bytes())))
+            bag.add(JOURNAL, now_ns, self._journal.model(zlib.crc32(model.read_bytes())))
 
     def add_reference(self, now_ns, motion):
         """Pass a reference to the controller."""
-        self._bag.motion(REFERENCE, now_ns, motion)
+        self._bag.add(REFERENCE, now_ns, motion)
         self._journal.count_reference(motion.stamp_ns)
         self.controller.add_reference(motion)
 
     def step(self, now_ns, measured):
         """Return the command for one odometry message."""
-        self._bag.motion(ODOMETRY, now_ns, measured)
+        self._bag.add(ODOMETRY, now_ns, measured)
         command, status = self.controller.step(measured)
-        self._bag.command(now_ns + LATER, command)
-        self._bag.row(now_ns + 2 * LATER, self._journal.step(measured.stamp_ns))
+        self._bag.add(COMMAND, now_ns + LATER, command)
+        self._bag.add(JOURNAL, now_ns + 2 * LATER, self._journal.step(measured.stamp_ns))
         self._steps += 1
         if self._steps % self._every == 0:
             for name, value in zip(FIELDS, output_row(command, status), strict=True):
-                if name in SCALAR_NAMES:
-                    self._bag.number(now_ns + 3 * LATER, name, value)
+                if name in SCALAR_NAMES and math.isfinite(value):
+                    self._bag.add(f'{CONTROLLER}/{name}', now_ns + 3 * LATER, value)
         return command
 
     def step_without_odometry(self, now_ns):
         """Pass an instant in a gap of the odometry."""
         found = self.controller.step_without_odometry(now_ns)
         if found is not None:
-            self._bag.command(now_ns + LATER, found[0])
-            self._bag.row(now_ns + 2 * LATER, self._journal.step_without_odometry(now_ns))
+            self._bag.add(COMMAND, now_ns + LATER, found[0])
+            self._bag.add(JOURNAL, now_ns + 2 * LATER, self._journal.step_without_odometry(now_ns))
 
     def add_range(self, now_ns, sensor, reading):
         """Pass a range reading (m) to the controller."""
-        self._bag.row(now_ns, self._journal.range(sensor, reading))
+        self._bag.add(JOURNAL, now_ns, self._journal.range(sensor, reading))
         self.controller.add_range(sensor, reading)
 
     def time_out(self, now_ns):
         """Handle missing odometry: stop."""
         self.controller.check_odometry(None, now_ns)
-        self._bag.command(now_ns, STANDSTILL)
+        self._bag.add(COMMAND, now_ns, STANDSTILL)
         row = self._journal.odometry_timeout(self.controller.status.stamp_ns)
-        self._bag.row(now_ns + LATER, row)
+        self._bag.add(JOURNAL, now_ns + LATER, row)
 
     def enable(self, now_ns, on):
         """Enable or disable motion."""
         self.controller.enable(on)
-        self._bag.row(now_ns, self._journal.enable(on))
+        self._bag.add(JOURNAL, now_ns, self._journal.enable(on))
 
     def reset(self, now_ns):
         """Reset the controller."""
         self.controller.reset()
-        self._bag.row(now_ns, self._journal.reset())
+        self._bag.add(JOURNAL, now_ns, self._journal.reset())
 
     def configure(self, now_ns, changes):
         """Apply other dynamic parameters."""
         parameters = self.controller.parameters.with_values(changes)
         self.controller.configure(parameters)
         row = self._journal.configure()
-        self._bag.parameters(now_ns, self._journal.revision, parameters.to_dict())
-        self._bag.row(now_ns, row)
+        text = parameters_to_json(self._journal.revision, parameters.to_dict())
+        self._bag.add(PARAMETERS, now_ns, text)
+        self._bag.add(JOURNAL, now_ns, row)
 
     def finish(self, now_ns):
         """Publish the final stop."""
-        self._bag.command(now_ns, STANDSTILL)
-        self._bag.row(now_ns + LATER, self._journal.finish())
+        self._bag.add(COMMAND, now_ns, STANDSTILL)
+        self._bag.add(JOURNAL, now_ns + LATER, self._journal.finish())
 
 
 START_NS = 1_700_000_000 * NANOSECONDS

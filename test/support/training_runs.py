@@ -16,10 +16,10 @@
 import numpy as np
 
 from support.bag_messages import START, serialised
-from support.golden_bags import ControllerBag, RecordedController
+from support.golden_bags import RecordedController
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import ControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_replay import TYPES as RECORDED
+from t3mpc_ros.evaluation.process_replay.controller_replay import TYPES, cdr_bytes
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
@@ -65,14 +65,14 @@ class Tape:
         return folder
 
 
-class TapeBag(ControllerBag):
+class TapeBag:
     """Keeps the messages of a controller in a tape."""
 
     def __init__(self, tape):
         self.tape = tape
 
-    def _write(self, topic, now_ns, data):
-        self.tape.rows.append((now_ns, f'/{topic}', RECORDED[topic], data))
+    def add(self, topic, now_ns, value):
+        self.tape.rows.append((now_ns, f'/{topic}', TYPES[topic], cdr_bytes(value)))
 
 
 class TrainingRun:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import math
 from pathlib import Path
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -38,11 +39,10 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     inputs_of,
     motions,
 )
-from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.topic_roles import COMMAND, JOURNAL, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.occupancy_map_file import MapError, load_map
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, State
-from t3mpc_ros.parameters.table import Value
 from t3mpc_ros.simulation.world import WorldError, load_world
 
 OPEN_LOOP = (
@@ -194,29 +194,32 @@ def recompute_scalars(
 # -- bag of a replay ------------------------------------------------------------------------------
 
 
+PARAMETERS = f'{CONTROLLER}/parameters'
 TYPES: Mapping[str, str] = {
     REFERENCE: 'nav_msgs/msg/Odometry',
     ODOMETRY: 'nav_msgs/msg/Odometry',
     COMMAND: 'geometry_msgs/msg/Twist',
-    f'{CONTROLLER}/journal': 'std_msgs/msg/Int64MultiArray',
-    f'{CONTROLLER}/parameters': 'std_msgs/msg/String',
+    JOURNAL: 'std_msgs/msg/Int64MultiArray',
+    PARAMETERS: 'std_msgs/msg/String',
     **{f'{CONTROLLER}/{name}': 'std_msgs/msg/Float64' for name in SCALAR_NAMES},
 }
 """Types of the topics by relative name."""
 LATER = 20_000
 """ns between a command and the telemetry of the same step."""
 
-_HEAD = b'\x00\x01\x00\x00'  # CDR, little-endian
-_NO_COVARIANCE = bytes(36 * 8)
 
+class ControllerBag(BagWriter):
+    """A bag with the topics and the metadata record of a controller."""
 
-def controller_bag(folder: Path, parameters: ControllerParameters) -> BagWriter:
-    """Return the writer of a bag with the topics and the metadata record of a controller."""
-    own = {CONTROLLER: {key: str(value) for key, value in parameters.to_dict().items()}}
-    writer = BagWriter(folder, metadata_records=own)
-    for topic, kind in TYPES.items():
-        writer.add_topic(f'/{topic}', kind)
-    return writer
+    def __init__(self, folder: Path, parameters: ControllerParameters) -> None:
+        own = {CONTROLLER: {key: str(value) for key, value in parameters.to_dict().items()}}
+        super().__init__(folder, metadata_records=own)
+        for topic, kind in TYPES.items():
+            self.add_topic(f'/{topic}', kind)
+
+    def add(self, topic: str, when_ns: int, value: object) -> None:
+        """Write a message; receive time and publish time are equal."""
+        self.write(f'/{topic}', when_ns, when_ns, cdr_bytes(value))
 
 
 def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) -> Path:
@@ -225,66 +228,53 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
     Scalars are written at every step. Messages have the times of the recorded run, so that both
     bags can be viewed together.
     """
-    messages: list[tuple[int, str, bytes]] = []
+    messages: list[tuple[int, str, object]] = []
     for topic, column in ((REFERENCE, inputs.references), (ODOMETRY, inputs.odometry)):
         for when, motion in zip(column.received_ns.tolist(), motions(column), strict=True):
-            messages.append((when, topic, odometry_bytes(motion)))
+            messages.append((when, topic, motion))
     times = inputs.start_ns + np.round(inputs.time * NANOSECONDS).astype(np.int64)
     commands = zip(*(again.fields[name].tolist() for name in SPEEDS), strict=True)
     for when, twist in zip(times.tolist(), commands, strict=True):
         if all(map(math.isfinite, twist)):
-            messages.append((when - LATER, COMMAND, twist_bytes(BodyTwist(*twist))))
+            messages.append((when - LATER, COMMAND, BodyTwist(*twist)))
     for name in SCALAR_NAMES:
         for when, value in zip(times.tolist(), again.fields[name].tolist(), strict=True):
             if math.isfinite(value):
-                messages.append((when + LATER, f'{CONTROLLER}/{name}', float_bytes(value)))
+                messages.append((when + LATER, f'{CONTROLLER}/{name}', value))
     for session in inputs.sessions:
         for when, row in zip(times[session.first :].tolist(), session.rows.tolist(), strict=False):
-            messages.append((when, f'{CONTROLLER}/journal', row_bytes(row)))
+            messages.append((when, JOURNAL, row))
         first = int(times[session.first]) - 2 * LATER
         for revision, parameters in session.parameters.items():
-            data = revision_bytes(revision, parameters.with_values(again.changed).to_dict())
-            messages.append((first, f'{CONTROLLER}/parameters', data))
-    with controller_bag(folder, again.parameters) as writer:
-        for when, topic, data in sorted(messages, key=lambda message: message[0]):
-            writer.write(f'/{topic}', when, when, data)
-        return writer.path
+            data = parameters_to_json(revision, parameters.with_values(again.changed).to_dict())
+            messages.append((first, PARAMETERS, data))
+    with ControllerBag(folder, again.parameters) as bag:
+        for when, topic, value in sorted(messages, key=lambda message: message[0]):
+            bag.add(topic, when, value)
+        return bag.path
 
 
-def twist_bytes(twist: BodyTwist) -> bytes:
-    """Return a ``geometry_msgs/msg/Twist`` as CDR."""
-    return _HEAD + struct.pack('<6d', twist.linear, 0.0, 0.0, 0.0, 0.0, twist.angular)
+def cdr_bytes(value: Any) -> bytes:
+    """Return text, number, command, motion or row of the journal as a message of its type."""
+    return b'\x00\x01\x00\x00' + _body(value)  # CDR, little-endian
 
 
-def float_bytes(value: float) -> bytes:
-    """Return a ``std_msgs/msg/Float64`` as CDR."""
-    return _HEAD + struct.pack('<d', value)
-
-
-def row_bytes(row: Sequence[int]) -> bytes:
-    """Return a row of the journal, a ``std_msgs/msg/Int64MultiArray``, as CDR."""
-    return _HEAD + struct.pack('<IIIxxxx5q', 0, 0, 5, *row)
-
-
-def revision_bytes(revision: int, values: Mapping[str, Value]) -> bytes:
-    """Return a revision of the parameters, a ``std_msgs/msg/String``, as CDR."""
-    return _HEAD + _text(parameters_to_json(revision, values))
-
-
-def odometry_bytes(motion: State) -> bytes:
-    """Return a ``nav_msgs/msg/Odometry`` as CDR, with the default frames of the nodes."""
-    seconds, rest = divmod(motion.stamp_ns, NANOSECONDS)
-    body = struct.pack('<iI', seconds, rest)
-    for text in ('odom', 'base_link'):
-        body += bytes(-len(body) % 4) + _text(text)
-    body += bytes(-len(body) % 8)
-    half = 0.5 * motion.pose.yaw
-    pose = (motion.pose.x, motion.pose.y, 0.0, 0.0, 0.0, math.sin(half), math.cos(half))
-    body += struct.pack('<7d', *pose) + _NO_COVARIANCE
-    body += twist_bytes(motion.twist)[len(_HEAD) :] + _NO_COVARIANCE
-    return _HEAD + body
-
-
-def _text(text: str) -> bytes:
-    content = text.encode() + b'\x00'
-    return struct.pack('<I', len(content)) + content
+def _body(value: Any) -> bytes:
+    match value:
+        case str():
+            content = value.encode() + b'\x00'
+            return struct.pack('<I', len(content)) + content
+        case float():
+            return struct.pack('<d', value)
+        case BodyTwist():
+            return struct.pack('<6d', value.linear, 0.0, 0.0, 0.0, 0.0, value.angular)
+        case State():
+            body = struct.pack('<iI', *divmod(value.stamp_ns, NANOSECONDS))
+            for text in ('odom', 'base_link'):  # the default frames of the nodes
+                body += bytes(-len(body) % 4) + _body(text)
+            half, no_covariance = 0.5 * value.pose.yaw, bytes(36 * 8)
+            pose = (value.pose.x, value.pose.y, 0.0, 0.0, 0.0, math.sin(half), math.cos(half))
+            body += bytes(-len(body) % 8) + struct.pack('<7d', *pose) + no_covariance
+            return body + _body(value.twist) + no_covariance
+        case _:  # a row of the journal
+            return struct.pack('<IIIxxxx5q', 0, 0, 5, *value)
