@@ -23,7 +23,7 @@ import sqlite3
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
-from support.bag_messages import START, TYPES, diagnostics, header, odometry_message, twist_message
+from support.bag_messages import START, TYPES, diagnostics, odometry_message, twist_message
 from support.long_tests import few_of
 from support.report_run import sections_of
 from support.robot_bags import following_rows, write
@@ -41,14 +41,13 @@ from t3mpc_ros.evaluation.bag_report.report_page import motion_rows
 from t3mpc_ros.evaluation.drive_response import fit_response, lag_behind, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, ReportOptions
 
-STAMPED, TEXT = 'geometry_msgs/msg/TwistStamped', 'std_msgs/msg/String'
 DEAD_TIME, LAG, GAIN = 0.12, 0.18, 0.9
 
 
 # -- bags of other robots -----------------------------------------------------------------------
 
 
-def drive(duration=40.0, command_rate=10.0, odom_rate=25.0, seed=0):
+def drive(duration=40.0, seed=0):
     """Return (time, command) and (time, speed, pose) of a robot that is slow to answer."""
     rng = np.random.default_rng(seed)
     step = 0.002
@@ -58,7 +57,7 @@ def drive(duration=40.0, command_rate=10.0, odom_rate=25.0, seed=0):
         told[row : row + round(2.0 / step)] = rng.uniform(-1.0, 1.0, 2) * (0.22, 1.2)
     told[: round(1.0 / step)] = 0.0
     told[round(20.0 / step) : round(23.0 / step)] = 0.0
-    every = round(1.0 / command_rate / step)
+    every = round(0.1 / step)
     held = told[np.arange(count) // every * every]
     late = round(DEAD_TIME / step)
     acting = np.vstack([np.zeros((late, 2)), held])[:count]
@@ -70,23 +69,20 @@ def drive(duration=40.0, command_rate=10.0, odom_rate=25.0, seed=0):
         v, w = speed[k] * step
         pose[k] = x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w
     time = step * np.arange(count)
-    odom = np.arange(0, count, round(1.0 / odom_rate / step))
+    odom = np.arange(0, count, round(0.04 / step))
     return (time[::every], held[::every]), (time[odom], speed[odom], pose[odom])
 
 
-def rows_of(names=('/odom', '/cmd_vel'), stamped=False, space='', **given):
+def rows_of(odom='/odom', cmd_vel='/cmd_vel', **given):
     """Return (receipt in s, topic, message) of a drive, under a robot's own names."""
     (told_at, told), (seen_at, seen, poses) = drive(**given)
     rows = []
     for t, speed, pose in zip(seen_at, seen, poses, strict=True):
         stamp = START + round(t * 1e9)
-        message = odometry_message(stamp, speed, pose, 'base_footprint')
-        rows.append((t + 0.001, space + names[0], message))
-    for t, command in zip(told_at, told, strict=True):
-        message = twist_message(command)
-        if stamped:
-            message = TYPES[STAMPED](header(START + round(t * 1e9), 'base_link'), message)
-        rows.append((t, space + names[1], message))
+        rows.append((t + 0.001, odom, odometry_message(stamp, speed, pose, 'base_footprint')))
+    rows += [
+        (t, cmd_vel, twist_message(command)) for t, command in zip(told_at, told, strict=True)
+    ]
     return sorted(rows, key=lambda row: row[0])
 
 
@@ -200,8 +196,8 @@ def test_the_wheels_may_be_told(rows, tmp_path, capsys):
 
 
 def test_the_likeliest_topic_is_chosen_and_the_others_are_listed(tmp_path, capsys):
-    rows = rows_of(('/wheels/odometry', '/base/cmd_vel'), duration=10.0)
-    extra = rows_of(('/gps/odom_map', '/joy/velocity'), duration=5.0, seed=3)
+    rows = rows_of('/wheels/odometry', '/base/cmd_vel', duration=10.0)
+    extra = rows_of('/gps/odom_map', '/joy/velocity', duration=5.0, seed=3)
     folder = write(tmp_path / 'bag', sorted(rows + extra, key=lambda row: row[0]))
     _, page = text_of(folder, capsys)
     assert 'taken from /wheels/odometry; there is also /gps/odom_map (--odom chooses).' in page
@@ -255,7 +251,7 @@ def test_a_run_whose_reference_is_named_is_judged(tmp_path, capsys):
     ],
 )
 def test_a_bag_without_motion_is_an_error_that_lists_its_topics(tmp_path, capsys, options, words):
-    text = TYPES[TEXT](data='hello')
+    text = TYPES['std_msgs/msg/String'](data='hello')
     folder = write(tmp_path / 'bag', [(0.1 * i, '/chatter', text) for i in range(5)])
     output = tmp_path / 'out'
     for program, before in ((bag_main, []), (t3mpc, ['bag'])):

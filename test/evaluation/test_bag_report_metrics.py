@@ -32,7 +32,7 @@ from support.bag_messages import (
     odometry_message,
     twist_message,
 )
-from support.report_run import RUN, sections_of
+from support.report_run import RUN, sections_of, text_of
 from support.robot_bags import write_with_records
 
 from t3mpc_ros.bag.reader import open_bag
@@ -160,36 +160,26 @@ def report(bag, tmp_path_factory):
     return write_report(bag, tmp_path_factory.mktemp('report'))
 
 
-class Page(HTMLParser):
-    """What a browser would make of the page, and whether its tags are closed."""
+class Tags(HTMLParser):
+    """Asserts that the tags of a page are closed."""
 
-    def __init__(self, text):
+    def __init__(self, page):
         super().__init__()
-        self.stack, self.charts, self.texts, self.external = [], [], [], []
-        self.feed(text)
+        self.stack = []
+        self.feed(page)
+        assert self.stack == []
 
     def handle_starttag(self, tag, attrs):
-        attrs = dict(attrs)
         if tag != 'meta':
             self.stack.append(tag)
-        if 'chart' in attrs.get('class', '').split():
-            self.charts.append(attrs['id'])
-        self.external += [attrs[key] for key in ('href', 'src') if key in attrs]
 
     def handle_endtag(self, tag):
         assert self.stack.pop() == tag
 
-    def handle_data(self, data):
-        if self.stack[-1:] not in (['script'], ['style']):
-            self.texts.append(data)
-
-    def text(self):
-        return ' '.join(' '.join(self.texts).split())
-
 
 def page_of(figures):
-    page = Page(figures.report.read_text(encoding='utf-8'))
-    assert page.stack == []
+    page = figures.report.read_text(encoding='utf-8')
+    Tags(page)
     return page
 
 
@@ -383,7 +373,7 @@ def test_another_namespace_is_named_and_can_be_chosen(tmp_path):
     rows = [(t, f'/fleet/robot1{topic}', message) for t, topic, message in first]
     rows += [(t, f'/fleet/robot2{topic}', message) for t, topic, message in second]
     rows.append((1.0, '/fleet/robot1/controller/skill/right', number(1.0)))
-    text = page_of(report_of(tmp_path, rows)).text()
+    text = text_of(page_of(report_of(tmp_path, rows)))
     assert 'namespace /fleet/robot1' in text
     assert 'The bag also holds topics of /fleet/robot2' in text
     with open_bag(tmp_path / 'bag') as recording:
@@ -433,13 +423,14 @@ def test_the_geometry_is_that_of_the_robot(metadata_records, expected, complaint
 
 
 def test_the_page_is_whole_and_needs_nothing_from_outside(report):
-    page = page_of(report)
+    text = page_of(report)
     sections = [each for each in SECTIONS if each.draw.__name__ != 'distance']  # follows no path
-    assert len(sections_of(report.report.read_text())) == len(sections)
-    text = report.report.read_text()
+    assert len(sections_of(text)) == len(sections)
     data = json.loads(re.search(r'id="data">(.*?)</script>', text)[1])
-    assert {*data['charts'], *data['planes']} == set(page.charts)
-    assert {each for each in page.external if not each.startswith('#')} == set()
+    drawn = re.findall(r'<figure class="chart[^"]*" id="([^"]+)"', text)
+    assert {*data['charts'], *data['planes']} == {*drawn}
+    tags = re.sub(r'(<script[^>]*>).*?</script>', r'\1', text, flags=re.DOTALL)
+    assert re.findall(r'\b(?:href|src)="[^#]', tags) == []
     assert 'width=device-width' in text
     assert not re.search(r'url\(|@import|https?:', text.partition('<script>')[0])
     assert not re.search(r'fetch\(|XMLHttp|import\(|WebSocket|EventSource', text)
@@ -469,7 +460,7 @@ def test_absent_topics_leave_out_their_figures_and_are_named(tmp_path):
     own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
     assert set(sections_of(figures.report.read_text())) == {*own, 'response'}
     assert 'controller/estimate/right' in figures.run.absent
-    text = page_of(figures).text()
+    text = text_of(page_of(figures))
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
 
 

@@ -17,9 +17,7 @@ All bags are of a robot that is 0.02 m/s faster than its reference: a report say
 cannot be measured.
 """
 
-from html import unescape
 import json
-import re
 import resource
 import sys
 
@@ -28,6 +26,7 @@ import pytest
 from rosbags.convert import convert
 from rosbags.typesys import Stores, get_typestore
 from support.bag_messages import START, STORE, TYPES, diagnostics, odometry_message, twist_message
+from support.report_run import text_of
 from support.robot_bags import following_rows, write, write_with_records
 
 from t3mpc_ros.cli.main import main as t3mpc
@@ -132,163 +131,141 @@ def thinned_after(second, every):
     return by_time(only('/cmd_vel', '/reference'), odometry[: -len(late)], late[::every])
 
 
+def odd_bag(make, headline, *words, measured=True):
+    """Return what makes rows, begin of the first sentence, other words, and what is measured.
+
+    The error is measured, or not (False), or as another one (None).
+    """
+    return make, headline, words, measured
+
+
 ODD_BAGS = {
-    # rows, begin of the first sentence, words, whether the error is measured
-    # (None: as another one)
-    'gap of a month': (
+    'gap of a month': odd_bag(
         month_later,
         'No odom for 30.0 days from 8.0 s on, the longest of 3 gaps; settled RMSE 0.571',
-        ('No message of /odom for 2592000.',),
-        True,
+        'No message of /odom for 2592000.',
     ),
-    'jump of the pose': (
+    'jump of the pose': odd_bag(
         lambda: changed('/odom', moved_away),
         'The position of odom jumps by 1e+06 m at 8.0 s; settled RMSE 0.571 / 0.571 rad/s.',
-        ('The position of /odom jumps by 1e+06 m at 8.0',),
-        True,
+        'The position of /odom jumps by 1e+06 m at 8.0',
     ),
-    'two robots from one place': (
+    'two robots from one place': odd_bag(
         lambda: by_time(ROWS, second_robot()),
         'The position of /odom jumps between its messages: several robots publish it, or',
-        ('or its pose disagrees with its twist; nothing measured from it is valid',),
-        False,
+        'or its pose disagrees with its twist; nothing measured from it is valid',
+        measured=False,
     ),
-    'two namespaces': (
+    'two namespaces': odd_bag(
         lambda: by_time(in_namespace('/one', ROWS), in_namespace('/two', only('/odom'))),
         'Good run',
-        ('also holds topics of /two: another robot',),
-        True,
+        'also holds topics of /two: another robot',
     ),
-    'odometry in another namespace': (
+    'odometry in another namespace': odd_bag(
         lambda: by_time(only('/cmd_vel', '/reference'), in_namespace('/base', only('/odom'))),
         'Good run',
-        ('Odometry is taken from /base/odom', 'also holds topics of /base'),
-        True,
+        'Odometry is taken from /base/odom',
+        'also holds topics of /base',
     ),
-    'odometry of two robots': (
+    'odometry of two robots': odd_bag(
         lambda: by_time(
             in_namespace('/one', only('/cmd_vel', '/reference')),
             [(t, '/one/wheels', message) for t, _, message in only('/odom')],
             [(t + k, '/two/wheels', message) for t, _, message in only('/odom') for k in (0, 1)],
         ),
         'Good run',
-        ('Odometry is taken from /one/wheels; there is also /two/wheels',),
-        True,
+        'Odometry is taken from /one/wheels; there is also /two/wheels',
     ),
-    'foreign types': (
+    'foreign types': odd_bag(
         lambda: by_time(
             only('/odom', '/reference'), [(1.0 + i, '/cmd_vel', TEXT) for i in range(9)]
         ),
         'The robot drove 3.56 m in 16.0 s; the bag holds no cmd_vel, so',
-        ('/cmd_vel is std_msgs/msg/String, not geometry_msgs/msg/Twist',),
-        True,
+        '/cmd_vel is std_msgs/msg/String, not geometry_msgs/msg/Twist',
     ),
-    'not a number': (
+    'not a number': odd_bag(
         lambda: changed('/odom', set_speed(np.nan)),
         'Good run',
-        ('7 messages of /odom hold a number that is not finite',),
-        True,
+        '7 messages of /odom hold a number that is not finite',
     ),
-    'only commands': (
+    'only commands': odd_bag(
         lambda: only('/cmd_vel'),
         'The bag holds no reference and no odom, so tracking cannot be judged.',
-        ('without a message: reference, odom',),
-        False,
+        'without a message: reference, odom',
+        measured=False,
     ),
-    'robot clock set back': (
+    'robot clock set back': odd_bag(
         lambda: changed('/odom', lambda i, t, m: restamped(m, -100.0 * (t > 8.0))),
         'Good run',
-        ('The stamps of /odom leap by -100.0 s at 8.0',),
-        True,
+        'The stamps of /odom leap by -100.0 s at 8.0',
     ),
-    'robot clock set back and forward again': (
+    'robot clock set back and forward again': odd_bag(
         lambda: changed('/odom', lambda i, t, m: restamped(m, -100.0 * (8.0 < t < 9.0))),
         'Good run',
-        ('The stamps of /odom leap by -100.0 s at 8.0 s, the first of 2 leaps: a clock was set',),
-        True,
+        'The stamps of /odom leap by -100.0 s at 8.0 s, the first of 2 leaps: a clock was set',
     ),
-    'robot clock set forward': (
-        lambda: changed('/odom', lambda i, t, m: restamped(m, 1e6 * (t > 8.0))),
-        'Good run',
-        ('The stamps of /odom leap by 1000000.0 s at 8.0',),
-        True,
-    ),
-    'no stamps': (
+    'no stamps': odd_bag(
         lambda: changed('/odom', lambda i, t, m: restamped(m, -t - START / 1e9)),
         'Good run',
-        ('The stamps of /odom are constant; its messages were placed by receive time',),
-        True,
+        'The stamps of /odom are constant; its messages were placed by receive time',
     ),
-    'simulated time': (
+    'simulated time': odd_bag(
         lambda: changed(
             '/reference',
             lambda i, t, m: restamped(m, 1.0 - START / 1e9),
             changed('/odom', lambda i, t, m: restamped(m, 1.0 - START / 1e9)),
         ),
         'Good run',
-        ('The stamps are of another clock than the receive times',),
-        True,
+        'The stamps are of another clock than the receive times',
     ),
-    'stands before and after': (
-        lambda: changed('/cmd_vel', stand_outside, changed('/odom', stand_outside)),
-        'Good run',
-        (),
-        True,
+    'stands before and after': odd_bag(
+        lambda: changed('/cmd_vel', stand_outside, changed('/odom', stand_outside)), 'Good run'
     ),
-    'driven for less than a second': (
+    'driven for less than a second': odd_bag(
         lambda: [
             (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' and t > 0.9 else m)
             for t, topic, m in ROWS
         ],
         'Only 0.4 of 0.4 s count: settled RMSE 0.571 / 0.571 rad/s.',
-        (),
-        True,
     ),
-    'receipt out of order': (
+    'receipt out of order': odd_bag(
         lambda: [(t - 3.0 * (i % 60 == 7), *row) for i, (t, *row) in enumerate(ROWS)],
         'Good run',
-        ('messages of /odom were out of order; they were sorted',),
-        True,
+        'messages of /odom were out of order; they were sorted',
     ),
-    'messages twice': (
-        lambda: by_time(ROWS, [(t + 0.0001, *row) for t, *row in only('/odom')]),
-        'Good run',
-        (),
-        True,
+    'messages twice': odd_bag(
+        lambda: by_time(ROWS, [(t + 0.0001, *row) for t, *row in only('/odom')]), 'Good run'
     ),
-    'robot at rest': (
+    'robot at rest': odd_bag(
         lambda: changed('/odom', stand),
         'The robot never moved, although it was to for 15.',
-        ('Every speed of /odom is zero in all 799 messages',),
-        None,
+        'Every speed of /odom is zero in all 799 messages',
+        measured=None,
     ),
-    'one message': (
+    'one message': odd_bag(
         lambda: only('/odom')[:1],
         'The bag holds no reference and no cmd_vel, so tracking cannot be judged.',
-        ('/odom has a single message: nothing follows from it',),
-        False,
+        '/odom has a single message: nothing follows from it',
+        measured=False,
     ),
-    'two rates': (
+    'two rates': odd_bag(
         lambda: thinned_after(8.0, 10),
         '44.4 % of odom is missing; settled RMSE 0.571',
-        ('of odom is missing',),
-        True,
+        'of odom is missing',
     ),
-    'reference at once': (
+    'reference at once': odd_bag(
         lambda: [
             (t if topic != '/reference' or t > 1.0 else 0.0, topic, m) for t, topic, m in ROWS
         ],
         'Good run',
-        (),
-        True,
     ),
-    'slow machine': (
+    'slow machine': odd_bag(
         lambda: by_time(
             [row for row in ROWS if row[1] != '/odom' or row[0] % 1 > 0.3], OVERLOADED
         ),
         'The machine was overloaded from 5.0 s on (sim_robot: processor overloaded): errors',
-        ("errors since then may not be the controller's", 'of odom is missing'),
-        True,
+        "errors since then may not be the controller's",
+        'of odom is missing',
     ),
 }
 
@@ -304,10 +281,6 @@ def first_screen(figures):
     """Return the text of the page before its contents."""
     page = figures.report.read_text(encoding='utf-8').partition('<main>')[2].partition('<nav')[0]
     return text_of(page)
-
-
-def text_of(page):
-    return ' '.join(unescape(re.sub(r'<[^>]*>', ' ', page)).split())
 
 
 def remarks(figures):

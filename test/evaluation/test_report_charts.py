@@ -65,75 +65,68 @@ def motion(topic, name):
     return RUN.motions[topic][name]
 
 
+def recorded(name):
+    return NUMBERS[f'controller/{name}']['value']
+
+
+def of_wheels(name):
+    return {f'{wheel} wheel': recorded(f'{name}/{wheel}') for wheel in WHEELS}
+
+
 def expected():
     """Return unit and lines of every chart by its title."""
     found = {}
-    for name, title, _, unit in BY_WHEEL:
+    symbols = dict(
+        zip((*TERM_NAMES, 'applied'), ('−g', '−Kδ', 'ṙ', 'v_c', 'v_p', 'u'), strict=True)
+    )
+    for name, title, *_ in BY_WHEEL:
         truth = {'robot (ground truth)': motion(TRUTH, name)}
         command = {'command': motion(COMMAND, name)}
         both = {'robot (odometry)': motion(ODOMETRY, name), 'reference': motion(REFERENCE, name)}
-        found[title] = unit, truth | both
-        found[f'Command, {title}'] = unit, command
-        found[f'Response, {title}'] = unit, truth | command
-        found[f'Terms, {title}'] = (
-            'rad/s²',
-            {
-                f'{term} {symbol}': NUMBERS[f'controller/terms/{term}/{name}']['value']
-                for term, symbol in zip(
-                    (*TERM_NAMES, 'applied'), ('−g', '−Kδ', 'ṙ', 'v_c', 'v_p', 'u'), strict=True
-                )
-            },
-        )
-        found[f'Estimate, {title}'] = (
-            'rad/s²',
-            {
-                'estimate g': NUMBERS[f'controller/estimate/{name}']['value'],
-                'target': estimation_target(RUN, name)['value'],
-            },
-        )
-
-    def of_wheels(name):
-        return {f'{w} wheel': NUMBERS[f'controller/{name}/{w}']['value'] for w in WHEELS}
-
+        of_law = {
+            f'{term} {sign}': recorded(f'terms/{term}/{name}') for term, sign in symbols.items()
+        }
+        target = estimation_target(RUN, name)['value']
+        found |= {
+            title: ('rad/s', truth | both),
+            f'Command, {title}': ('rad/s', command),
+            f'Response, {title}': ('rad/s', truth | command),
+            f'Terms, {title}': ('rad/s²', of_law),
+            f'Estimate, {title}': (
+                'rad/s²', {'estimate g': recorded(f'estimate/{name}'), 'target': target},
+            ),
+        }  # fmt: skip
     errors = {f'{w} wheel': motion(TRUTH, w) - motion(REFERENCE, w) for w in WHEELS}
-    found['Error'] = 'rad/s', errors
-    found['Acceleration u applied'] = 'rad/s²', of_wheels('terms/applied')
-    found['Skill of the predictor'] = 'share', of_wheels('skill')
-    found['V, half the squared error'] = (
-        'rad²/s²',
-        {'V': NUMBERS['controller/lyapunov/value']['value']},
-    )
-    found['Margin of the guaranteed decrease'] = (
-        'rad²/s³',
-        {'margin': NUMBERS['controller/lyapunov/margin']['value']},
-    )
-    signals = [NUMBERS[name]['value'] for name in SIGNAL_NAMES]
     labels = ('active mode', 'right wheel', 'left wheel')
-    found['Active mode and chaotic signals'] = 'number', dict(zip(labels, signals, strict=True))
-    found['radio: cycles answered since the report before'] = (
-        '%',
-        {'answered': np.array([math.nan, 95.0])},
-    )
-    found['Round trip'] = 'ms', {'median': LINK['round_trip_median_ms'],
-                                 '99 % below': LINK['round_trip_p99_ms']}  # fmt: skip
-    found['Faults since the first report'] = (
-        'number',
-        {
-            label: LINK[key] - 1.0
-            for key, label in {
-                'robot_resets': 'resets of the robot board',
-                'dongle_resets': 'resets of the dongle',
-                'port_failures': 'port failures',
-                'crc_errors': 'wrong checksums',
-                'frame_errors': 'malformed frames',
-            }.items()
-        },
-    )
-    found['From odometry to command'] = 'ms', {'latency': 2.0 + 4.0 * (np.arange(1999) % 20 == 0)}
-    found['Between two messages of odom'] = 'ms', {'odom': np.full(1999, 10.0)}
-    received = RUN.receipts[COMMAND]
-    found['Between two messages of cmd_vel'] = 'ms', {'cmd_vel': 1e3 * np.diff(received)}
-    return found
+    signals = (NUMBERS[name]['value'] for name in SIGNAL_NAMES)
+    trips = {'median': LINK['round_trip_median_ms'], '99 % below': LINK['round_trip_p99_ms']}
+    faults = {
+        'resets of the robot board': 'robot_resets',
+        'resets of the dongle': 'dongle_resets',
+        'port failures': 'port_failures',
+        'wrong checksums': 'crc_errors',
+        'malformed frames': 'frame_errors',
+    }
+    latency = 2.0 + 4.0 * (np.arange(1999) % 20 == 0)
+    answered = np.array([math.nan, 95.0])
+    return found | {
+        'Error': ('rad/s', errors),
+        'Acceleration u applied': ('rad/s²', of_wheels('terms/applied')),
+        'Skill of the predictor': ('share', of_wheels('skill')),
+        'V, half the squared error': ('rad²/s²', {'V': recorded('lyapunov/value')}),
+        'Margin of the guaranteed decrease': ('rad²/s³', {'margin': recorded('lyapunov/margin')}),
+        'Active mode and chaotic signals': ('number', dict(zip(labels, signals, strict=True))),
+        'radio: cycles answered since the report before': ('%', {'answered': answered}),
+        'Round trip': ('ms', trips),
+        'Faults since the first report': (
+            'number', {label: LINK[key] - 1.0 for label, key in faults.items()},
+        ),
+        'From odometry to command': ('ms', {'latency': latency}),
+        'Between two messages of odom': ('ms', {'odom': np.full(1999, 10.0)}),
+        'Between two messages of cmd_vel': (
+            'ms', {'cmd_vel': 1e3 * np.diff(RUN.receipts[COMMAND])},
+        ),
+    }  # fmt: skip
 
 
 DRAWN = [each for section in SECTIONS for each in section.draw(RUN, METRICS)]
@@ -220,7 +213,7 @@ def test_sentences_give_the_numbers_of_their_charts():
     )
     margin = CHARTS['Margin of the guaranteed decrease'].summary
     assert margin == 'The margin is below zero 25.0 % of the time.'
-    skills = [np.mean(NUMBERS[f'controller/skill/{wheel}']['value']) for wheel in WHEELS]
+    skills = [np.mean(each) for each in of_wheels('skill').values()]
     assert CHARTS['Skill of the predictor'].summary == (
         f'Mean: {number(skills[0])} of the right wheel, {number(skills[1])} of the left wheel.'
     )
@@ -234,7 +227,7 @@ def test_sentences_give_the_numbers_of_their_charts():
     )
     sizes = CHARTS['Terms, left wheel'].summary
     for term in (*TERM_NAMES, 'applied'):
-        values = NUMBERS[f'controller/terms/{term}/left']['value']
+        values = recorded(f'terms/{term}/left')
         assert f'{term} {number(np.sqrt(np.mean(values**2)))}' in sizes
 
 

@@ -13,6 +13,7 @@
 # limitations under the License.
 """A run, ready for a report, of which no two quantities are equal."""
 
+from html import unescape
 import re
 
 import numpy as np
@@ -75,6 +76,11 @@ RUN = Run(
     switches=np.array([8.0]), lead=0.205, complaints=(), changes=(),
     links=(LinkHistory('radio', REPORTS, LINK),), oddities=(), remarks=(),
 )  # fmt: skip
+
+
+def text_of(page):
+    """Return the text of a page without its tags."""
+    return ' '.join(unescape(re.sub(r'<[^>]*>', ' ', page)).split())
 
 
 def sections_of(page):
