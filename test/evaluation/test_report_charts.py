@@ -28,7 +28,7 @@ from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
     COUNTED,
     Cause,
-    LinkMetrics,
+    LinkHistory,
     cause_between,
 )
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, find_incidents
@@ -241,8 +241,11 @@ def test_tables_of_response_and_link_in_full():
         ['left wheel', *5 * [rows[1][1]]],
     ]
     counts = dict(zip(COUNTED, (1000.0, 13.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), strict=True))
-    links = {'radio': LinkMetrics(counts, 0.987, 0.0065, 0.012, 0.4)}
-    assert [row[1] for row in link_table(links).rows] == [
+    gauges = {'round_trip_median_ms': 6.5, 'round_trip_p99_ms': 12.0, 'telemetry_age_s': 0.4}
+    values = {key: np.array([0.0, value]) for key, value in counts.items()}
+    values |= {key: np.array([value, value]) for key, value in gauges.items()}
+    link = LinkHistory('radio', np.arange(2.0), values)
+    assert [row[1] for row in link_table([link]).rows] == [
         '98.7 %', '6.50 ms', '12.0 ms', '0.400 s', '1000', '13', '2', '3', '4', '5', '6', '7',
     ]  # fmt: skip
 

@@ -76,6 +76,17 @@ class LinkHistory:
         restarted = np.diff(self._starts()[rows]) > 0
         return float(np.where(restarted, known[1:], np.diff(known)).sum())
 
+    def total_answered(self) -> float:
+        """Return the share of answered cycles of the recording; NaN if unknown."""
+        made, failed = self.grown('cycles'), self.grown('cycles_lost')
+        if made > 0.0 and math.isfinite(failed):
+            return 1.0 - failed / made
+        return _over(np.nanmean, self.answered())
+
+    def over(self, measure: Callable[[Array], Any], key: str, unit: float = 1.0) -> float:
+        """Return a measure over the reports of a gauge in some SI unit; NaN if unknown."""
+        return unit * _over(measure, self.values.get(key, np.full(1, math.nan)))
+
     def _starts(self) -> NDArray[np.intp]:
         """Return how often the bridge was started anew up to each report, shape (n,).
 
@@ -86,38 +97,6 @@ class LinkHistory:
             rows = np.flatnonzero(np.isfinite(table))
             fell[rows[1:]] |= np.diff(table[rows]) < 0.0
         return np.cumsum(fell)
-
-
-@dataclass(frozen=True)
-class LinkMetrics:
-    """Quality of a link over a recording; NaN where it is unknown."""
-
-    counts: Mapping[str, float]
-    """Increase of each of :data:`COUNTED` over the recording."""
-    answered: float
-    """Share of the cycles."""
-    round_trip: float
-    """Median over the reports of the median round trip, s."""
-    round_trip_99: float
-    """Largest reported 99th percentile, s."""
-    oldest: float
-    """Largest reported age of the last measurement, s."""
-
-
-def link_metrics(link: LinkHistory) -> LinkMetrics:
-    """Return the summary of a link."""
-    counts = {key: link.grown(key) for key in COUNTED}
-    answered = _over(np.nanmean, link.answered())
-    if counts['cycles'] > 0.0 and math.isfinite(counts['cycles_lost']):
-        answered = 1.0 - counts['cycles_lost'] / counts['cycles']
-    empty = np.full(1, math.nan)
-    return LinkMetrics(
-        counts,
-        answered,
-        1e-3 * _over(np.nanmedian, link.values.get('round_trip_median_ms', empty)),
-        1e-3 * _over(np.nanmax, link.values.get('round_trip_p99_ms', empty)),
-        _over(np.nanmax, link.values.get('telemetry_age_s', empty)),
-    )
 
 
 def _over(measure: Callable[[Array], Any], values: Array) -> float:

@@ -456,36 +456,41 @@ def find_stalls(run: Run) -> list[Span]:
     commands = run.receipts.get(COMMAND) if run.ours else None
     if commands is not None and commands.size > 2:
         least = max(least, STALL_PERIODS * float(np.median(np.diff(commands))))
-        found += _pauses_of_commands(commands, odometry, least)
+        found += [
+            pause
+            for pause in _pauses(commands, least)
+            if _received(odometry, *pause) and _come_late(commands, odometry, *pause)
+        ]
     going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
     others = [run.receipts[name] for name in going_on if name in run.receipts]
     found = [span for span in found if not any(_received(each, *span) for each in others)]
     if commands is not None:
-        found += _late_commands(commands, odometry, least)
-    return merged([span for span in found if not _is_unread(run, *span, least)], -1e-6)
+        waits = np.column_stack(prompted_commands(odometry, commands))
+        length = waits[:, 1] - waits[:, 0]
+        found += map(tuple, waits[(length > least) & (length < MIN_GAP)].tolist())
+    unread = [(low - least, high + least) for low, high in run.lost]
+    return merged(
+        [
+            (start, end)
+            for start, end in found
+            if not any(low < end and start < high for low, high in unread)
+        ],
+        -1e-6,
+    )
 
 
-def _pauses_of_commands(commands: Array, odometry: Array, least: float) -> list[Span]:
-    """Return the spans between two commands in which odometry comes, and that they follow."""
-    return [
-        (low, high)
-        for low, high in _pauses(commands, least)
-        if _received(odometry, low, high) and _come_late(commands, odometry, low, high)
-    ]
+def prompted_commands(
+    odometry: Array, commands: Array, *, first: bool = True
+) -> tuple[Array, Array]:
+    """Return the newest odometry at each command, and the command, by receipt (s).
 
-
-def _late_commands(commands: Array, odometry: Array, least: float) -> list[Span]:
-    """Return the spans from a message of odometry to its command longer than ``least``, s."""
+    ``first`` selects the first command after each message: further ones do not wait for it.
+    """
     index = np.searchsorted(odometry, commands, 'right') - 1
-    prompt = (index >= 0) & (np.diff(index, prepend=-1) > 0)
-    late, asked = commands[prompt], odometry[index[prompt]]
-    slow = (late - asked > least) & (late - asked < MIN_GAP)
-    return list(zip(asked[slow].tolist(), late[slow].tolist(), strict=True))
-
-
-def _is_unread(run: Run, start: float, end: float, least: float) -> bool:
-    """Return whether a span is within ``least`` s of what a recovery could not read."""
-    return any(low - least < end and start < high + least for low, high in run.lost)
+    counted = index >= 0
+    if first:
+        counted &= np.diff(index, prepend=-1) > 0
+    return odometry[index[counted]], commands[counted]
 
 
 def _come_late(commands: Array, odometry: Array, low: float, high: float) -> bool:

@@ -21,8 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from t3mpc_ros.evaluation.bag_report import tracking_errors
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkMetrics, link_metrics
-from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkHistory
+from t3mpc_ros.evaluation.bag_report.incidents import (
+    Incidents,
+    find_incidents,
+    prompted_commands,
+)
 from t3mpc_ros.evaluation.bag_report.motion_continuity import gaps
 from t3mpc_ros.evaluation.bag_report.recorded_run import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
@@ -47,19 +51,12 @@ def variation(series: Series, name: str) -> float:
 
 
 def latencies(run: Run, *, first: bool = False) -> Series | None:
-    """Return the delay of each command after the newest odometry message, by receipt (s).
-
-    ``first`` selects the first command after each message: further ones do not wait for it.
-    """
+    """Return the delays of :func:`prompted_commands`, s."""
     odometry, commands = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
     if odometry is None or commands is None or ODOMETRY in run.untrusted:
         return None
-    index = np.searchsorted(odometry, commands, 'right') - 1
-    counted = index >= 0
-    if first:
-        counted &= np.diff(index, prepend=-1) > 0
-    commands, index = commands[counted], index[counted]
-    return Series(commands, {'value': commands - odometry[index]}) if commands.size else None
+    asked, sent = prompted_commands(odometry, commands, first=first)
+    return Series(sent, {'value': sent - asked}) if sent.size else None
 
 
 def estimation_target(run: Run, wheel: str) -> Series | None:
@@ -136,7 +133,6 @@ class ReportMetrics:
     """Metrics of ``right`` and ``left``; without wheel geometry ``linear`` and ``angular``."""
     responses: Mapping[str, ResponseFit]
     """Fitted response of the robot to its commands, by channel, where it is identifiable."""
-    links: Mapping[str, LinkMetrics]
     latency: float
     """Median time (s) from the receipt of odometry to that of the command."""
     latency_99: float
@@ -196,8 +192,8 @@ class ReportMetrics:
     def _link_rows(self) -> list[tuple[str, str, float]]:
         """Return what it is, unit and value of each number of each link."""
         return [
-            (f'{title}, {name}', unit, value(link))
-            for name, link in self.links.items()
+            (f'{title}, {link.name}', unit, value(link))
+            for link in self.run.links
             for title, unit, value in LINK_NUMBERS
         ]
 
@@ -249,12 +245,18 @@ RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
     ('odometry to command, 99 % below', 'ms', lambda found: 1e3 * found.latency_99),
     ('odometry missing', '%', lambda found: 100.0 * found.missing.get(ODOMETRY, math.nan)),
 )  # fmt: skip
-LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
-    ('cycles answered', '%', lambda link: 100.0 * link.answered),
-    ('round trip, median', 'ms', lambda link: 1e3 * link.round_trip),
-    ('round trip, worst 99 %', 'ms', lambda link: 1e3 * link.round_trip_99),
-    ('oldest measurement', 's', lambda link: link.oldest),
-)
+LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkHistory], float]], ...] = (
+    ('cycles answered', '%', lambda link: 100.0 * link.total_answered()),
+    (
+        'round trip, median', 'ms',
+        lambda link: 1e3 * link.over(np.nanmedian, 'round_trip_median_ms', 1e-3),
+    ),
+    (
+        'round trip, worst 99 %', 'ms',
+        lambda link: 1e3 * link.over(np.nanmax, 'round_trip_p99_ms', 1e-3),
+    ),
+    ('oldest measurement', 's', lambda link: link.over(np.nanmax, 'telemetry_age_s')),
+)  # fmt: skip
 
 
 def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
@@ -289,7 +291,6 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
         messages=messages,
         wheels=wheels,
         responses=responses(run),
-        links={link.name: link_metrics(link) for link in run.links},
         latency=float(np.percentile(delays, 50.0)),
         latency_99=float(np.percentile(delays, 99.0)),
         missing=missing,

@@ -24,7 +24,7 @@ from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording_metadata import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.evaluation.bag_report import incidents
-from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkHistory
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,
     UNMEASURED,
@@ -86,15 +86,15 @@ def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
     return Table('', head, rows)
 
 
-def link_table(links: Mapping[str, LinkMetrics]) -> Table:
+def link_table(links: Sequence[LinkHistory]) -> Table:
     """Return the metrics of each link, one column each."""
     rows = [
-        [title, *(f'{format_number(value(each))} {unit}' for each in links.values())]
+        [title, *(f'{format_number(value(each))} {unit}' for each in links)]
         for title, unit, value in LINK_NUMBERS
     ]
     for key, text in COUNTED.items():
-        rows.append([text, *(_whole(each.counts[key]) for each in links.values())])
-    return Table('', ['quantity', *links], rows if links else [])
+        rows.append([text, *(_whole(each.grown(key)) for each in links)])
+    return Table('', ['quantity', *(each.name for each in links)], rows if links else [])
 
 
 def _whole(value: float) -> str:
@@ -263,7 +263,7 @@ def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
     """Yield the tables of response, motion and radio link, with their titles."""
     tables = [
         ('Path and stops', Table('', ['quantity', 'value'], motion_rows(run))),
-        ('Radio link', link_table(figures.links)),
+        ('Radio link', link_table(run.links)),
     ]
     if figures.responses:
         yield Heading('From command to motion')

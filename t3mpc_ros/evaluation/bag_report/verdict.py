@@ -43,7 +43,6 @@ from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.result_output import format_number
 from t3mpc_ros.evaluation.run_record import ON_PATH, counted_from
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
-from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
 MAX_STOPPED = 0.01
@@ -86,8 +85,6 @@ class Verdict:
     """What else happened, in sentences."""
     sound: bool = True
     """Whether nothing speaks against the numbers."""
-    judged: bool = True
-    """Whether the bag holds a closed loop, which can be judged."""
     slow: bool = False
     """Whether the machine was too slow, which explains what is wrong if anything is."""
     damaged: bool = False
@@ -126,7 +123,6 @@ def judge(
     ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
     """
     findings = [_Finding(text, '', remedy, spoils=True) for text, remedy in run.damage.items()]
-    damaged = bool(findings)
     if several := run.publishers:
         text, spoils = ', '.join(several), any(several.values())
         findings.append(_Finding(text, 'Several publishers', SINGLE_PUBLISHER, spoils))
@@ -139,21 +135,22 @@ def judge(
             f'Set the clocks of the computers, or stamp {ODOMETRY} by that of the controller.',
             spoils=True,
         )
-        return _verdict(run, [*findings, said], '', judged=False, damaged=damaged)
-    lacking = _lacking(run)
+        return _verdict(run, [*findings, said], '', judged=False)
+    lacking = [name for name in (REFERENCE, COMMAND) if name not in run.motions]
+    lacking += [] if run.measured else [ODOMETRY]
     if run.measured in run.untrusted:
-        return _verdict(run, findings, '', judged=not lacking, damaged=True)
+        return _verdict(run, findings, '', judged=not lacking)
     if lacking:
         said = _Finding(
             _without(run, incidents, lacking), 'Data missing: tracking cannot be judged'
         )
         if run.measured:
             findings += [*_interruptions(run, incidents), *_jumps(incidents)]
-        return _verdict(run, [*findings, said], said.text, judged=False, damaged=damaged)
+        return _verdict(run, [*findings, said], said.text, judged=False)
     first, last = driving(run)
     if not first < last:
         findings.append(_never_driven(run))
-        return _verdict(run, findings, 'every command was zero', damaged=damaged)
+        return _verdict(run, findings, 'every command was zero')
     findings += _interruptions(run, incidents)
     slow = [*_slow_machine(run, incidents)]
     loss = []
@@ -161,30 +158,21 @@ def judge(
         text = f'{100.0 * missing:.1f} % of {ODOMETRY} is missing'
         loss.append(_Finding(text, 'Data missing', spoils=True))
     else:
-        shares = {COMMAND: _missing_commands(run), REFERENCE: _missing_reference(run)}
         loss += [
             _Finding(f'{100.0 * share:.1f} % of {name} is missing or not finite', 'Data missing')
-            for name, share in shares.items()
+            for name, share in _missing_shares(run).items()
             if share > MAX_MISSING
         ]
     findings += [*_jumps(incidents), *_lost_parts(run), *slow, *loss]
     late = _late(run, latency_99)
-    distance, on_path = path_distance(run), None
+    on_path = None
     if run.follows_path:
-        on_path = share_on_path(run)
-        error, reached = _path_finding(
-            on_path,
-            None if distance is None else distance['value'],
-            detours=run.parameters.get('controller', {}).get('keep_out.enabled') == 'True',
-        )
+        error, reached, on_path = _path_finding(run)
     else:
         error, reached = _error_finding(run, counted, last - counted_from(first, last))
     if error is not None:
         findings.append(error)
-    slowly = bool(slow or late)
-    return _verdict(
-        run, findings, reached, slow=slowly, damaged=damaged, on_path=on_path, detail=late
-    )
+    return _verdict(run, findings, reached, slow=bool(slow or late), on_path=on_path, detail=late)
 
 
 def _verdict(
@@ -194,7 +182,6 @@ def _verdict(
     *,
     judged: bool = True,
     slow: bool = False,
-    damaged: bool = False,
     on_path: float | None = None,
     detail: str = '',
 ) -> Verdict:
@@ -207,9 +194,8 @@ def _verdict(
         'good',
         details=(*run.doubts, *([detail] if detail else [])),
         sound=judged and not spoilt,
-        judged=judged,
         slow=slow,
-        damaged=damaged,
+        damaged=bool(run.damage),
         on_path=on_path,
     )
     if not findings:
@@ -242,14 +228,6 @@ def duration_text(seconds: float) -> str:
 
 
 # -- the recording --------------------------------------------------------------------------------
-
-
-def _lacking(run: Run) -> tuple[str, ...]:
-    """Return what a closed loop has, and the run has not."""
-    lacking = [name for name in (REFERENCE, COMMAND) if name not in run.motions]
-    if not run.measured:
-        lacking.append(ODOMETRY)
-    return tuple(lacking)
 
 
 def _without(run: Run, incidents: Incidents, lacking: Sequence[str]) -> str:
@@ -394,19 +372,19 @@ def _late(run: Run, latency_99: float) -> str:
     )
 
 
-def _missing_commands(run: Run) -> float:
-    """Return the missing share of the commands of our controller, one to each odometry."""
-    command, odometry = run.timing.get(COMMAND), run.timing.get(ODOMETRY)
-    if not run.ours or command is None or odometry is None or run.other_clock:
-        return 0.0
-    same = abs(command.period - odometry.period) < 0.2 * odometry.period
-    return command.missing - odometry.missing if same else 0.0
+def _missing_shares(run: Run) -> dict[str, float]:
+    """Return the missing share of what our nodes send regularly, by relative name.
 
-
-def _missing_reference(run: Run) -> float:
-    """Return the missing share of the reference of our generator, which comes regularly."""
-    reference = run.timing.get(REFERENCE)
-    return reference.missing if run.ours and reference is not None else 0.0
+    Our controller sends a command to each odometry.
+    """
+    found = {}
+    command, odometry, reference = (run.timing.get(n) for n in (COMMAND, ODOMETRY, REFERENCE))
+    if command and odometry and not run.other_clock:
+        same = abs(command.period - odometry.period) < 0.2 * odometry.period
+        found[COMMAND] = command.missing - odometry.missing if same else 0.0
+    if reference is not None:
+        found[REFERENCE] = reference.missing
+    return found if run.ours else {}
 
 
 def _lost_parts(run: Run) -> Iterator[_Finding]:
@@ -477,32 +455,28 @@ def _error_finding(run: Run, counted: float, length: float) -> tuple[_Finding | 
     return None, reached
 
 
-def share_on_path(run: Run) -> float:
-    """Return the share of the drive in which the robot is within :data:`ON_PATH` of its path."""
+def _path_finding(run: Run) -> tuple[_Finding | None, str, float]:
+    """Return what speaks against the path of a patrol, if anything, and how well it was driven.
+
+    Last the share of the drive in which the robot is within :data:`ON_PATH` of its path.
+    """
     distance = path_distance(run)
-    return 0.0 if distance is None else float(np.mean(distance['value'] <= ON_PATH))
-
-
-def _path_finding(
-    share: float, distance: Array | None, *, detours: bool
-) -> tuple[_Finding | None, str]:
-    """Return what speaks against the path of a patrol, if anything, and how well it was driven."""
     within = f'within {1e3 * ON_PATH:g} mm of its path for'
     if distance is None:
         text = 'the robot did not follow its path: the bag holds no positions of both'
-        return _Finding(text, 'Did not follow its path', spoils=True), 'the path is not known'
-    error = f'path error {1e3 * rms(distance):.1f} mm (RMS)'
+        return _Finding(text, 'Did not follow its path', spoils=True), 'the path is not known', 0.0
+    share = float(np.mean(distance['value'] <= ON_PATH))
+    error = f'path error {1e3 * rms(distance["value"]):.1f} mm (RMS)'
     percent = f'{100.0 * share:.0f} % of the drive'
     if share < MIN_ON_PATH:
         text = f'the robot did not follow its path: {within} only {percent}, {error}'
-        return _Finding(text, 'Did not follow its path', spoils=True), error
+        return _Finding(text, 'Did not follow its path', spoils=True), error, share
+    detours = run.parameters.get('controller', {}).get('keep_out.enabled') == 'True'
     rest = '; the rest were detours around obstacles and the ways back'
-    if share > 0.995 or not detours:
-        rest = ''
-    reached = f'{within} {percent}, {error}{rest}'
+    reached = f'{within} {percent}, {error}{rest if detours and share <= 0.995 else ""}'
     if share < MOSTLY:
-        return _Finding(f'mostly off its path: {reached}', 'Mostly off its path'), reached
-    return None, reached
+        return _Finding(f'mostly off its path: {reached}', 'Mostly off its path'), reached, share
+    return None, reached, share
 
 
 # -- known result ---------------------------------------------------------------------------------
