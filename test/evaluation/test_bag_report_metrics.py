@@ -54,8 +54,7 @@ from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_comparison import error_differences
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    driven,
-    driven_and_settled,
+    counted,
     settled_rmse,
     statistics,
     tracking_error,
@@ -300,8 +299,7 @@ def test_a_bag_and_a_run_have_the_same_settled_error(run, duration, switches):
     }
     recorded = replace(run, motions=motions, switches=record.switches)
     truth = tracking_error(recorded, TRUTH).time
-    np.testing.assert_array_equal(driven(truth, recorded), simulated.counted)
-    np.testing.assert_array_equal(driven_and_settled(truth, recorded), simulated.settled)
+    np.testing.assert_array_equal(counted(truth, recorded), [simulated.counted, simulated.settled])
     both = math.hypot(*settled_rmse(recorded)) / math.sqrt(2.0)
     assert both == pytest.approx(SETTLED.value(simulated))
 
@@ -315,13 +313,13 @@ def test_the_drive_spans_the_first_to_the_last_nonzero_command(run):
     made = replace(run, motions=motions, switches=np.empty(0))
     assert driving(made) == (2.0, 5.0)
     # The first half of a short drive is its start.
-    assert time[driven(time, made)].tolist() == [4.0, 5.0]
+    assert time[counted(time, made)[0]].tolist() == [4.0, 5.0]
     # Where the reference comes later than the command, the robot has to catch up then.
     late = time[2:] + 1.5
-    assert late[driven(late, made)].tolist() == [4.5]
-    assert not driven(np.empty(0), made).size
+    assert late[counted(late, made)[0]].tolist() == [4.5]
+    assert not counted(np.empty(0), made)[0].size
     # A bag without commands does not say when the robot was driven.
-    assert time[driven(time, replace(made, motions={}))].tolist() == time[3:].tolist()
+    assert time[counted(time, replace(made, motions={}))[0]].tolist() == time[3:].tolist()
 
 
 def test_a_long_line_keeps_its_extremes():

@@ -317,22 +317,26 @@ def test_after_a_lost_message_comparison_resumes_at_a_reset(topic, words, bag, t
     assert int(np.count_nonzero(outcome.compared)) == inputs.events.size - gap.size
 
 
-def straight_on(folder, begins, steps, first=0):
-    """Record processes whose robot is reported at one place; references from step ``first`` on."""
+def straight_on(folder, begins=(START,), steps=200, first=0, model=None):
+    """Record processes whose robot is reported at one place; references from step ``first`` on.
+
+    Return the weights of the last one, which began with those of a file if one is given.
+    """
     parameters, twist = StepperControllerParameters(), BodyTwist(0.1, 0.2)
     with ControllerBag(folder, parameters) as writer:
         for begin in begins:
-            recorded = RecordedController(parameters, writer, begin)
+            recorded = RecordedController(parameters, writer, begin, model=model)
             for k in range(steps):
                 now = begin + 10_000_000 * k
                 if k >= first:
                     recorded.add_reference(now, State(now + 400_000_000, ORIGIN, twist))
-                recorded.step(now + 1000, State(now, ORIGIN, twist))
+                recorded.step(now + 1000, State(now, ORIGIN, BodyTwist(0.09, 0.18)))
+    return recorded.controller.law.get_weights()
 
 
 def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
     """The robot has not moved yet, as when the nodes have not all found each other."""
-    straight_on(tmp_path / 'bag', [START], 200, first=51)
+    straight_on(tmp_path / 'bag', first=51)
     lost = without(tmp_path / 'bag/bag_0.mcap', tmp_path / 'copy', lambda *it: it == ('/odom', 20))
     inputs = load_inputs(lost)
     assert any('1 odometry messages' in note for note in inputs.notes)
@@ -443,33 +447,17 @@ def test_the_journal_numbers_events_and_counts_references():
             parameters_from_json(text)
 
 
-def short_run(folder, model=None, steps=120):
-    """Drive along a gentle course, open loop: enough to see whether a model was loaded."""
-    parameters = StepperControllerParameters()
-    with ControllerBag(folder, parameters) as writer:
-        recorded = RecordedController(parameters, writer, START, model=model)
-        for k in range(steps + 40):
-            now = START + 10_000_000 * k
-            twist = BodyTwist(0.1 * math.sin(0.05 * k), 0.5)
-            recorded.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), twist))
-            if k >= 40:
-                lagging = BodyTwist(0.09 * math.sin(0.05 * (k - 41)), 0.45)
-                recorded.step(now + 500_000, State(now, Pose(0.0, 0.0, 0.0), lagging))
-        learnt = recorded.controller.law.get_weights()
-    return folder, learnt
-
-
 def test_a_model_is_found_by_its_checksum_or_missed_and_said(tmp_path):
-    _, learnt = short_run(tmp_path / 'first')
+    learnt = straight_on(tmp_path / 'first')
     learnt['fuzzy.coefficients'] = learnt['fuzzy.coefficients'] + 0.3
     model = tmp_path / 'model.npz'
     save_model(model, learnt, {})
-    folder, _ = short_run(tmp_path / 'second', model)
-    lost = load_inputs(folder)
+    straight_on(tmp_path / 'second', model=model)
+    lost = load_inputs(tmp_path / 'second')
     assert any('give it by --model' in note for note in lost.notes)
     assert not lost.exact.any()
     assert not compare(lost, replay_controller(lost)).same
-    given = load_inputs(folder, model=learnt)
+    given = load_inputs(tmp_path / 'second', model=learnt)
     assert given.exact.all()
     assert compare(given, replay_controller(given)).same
 

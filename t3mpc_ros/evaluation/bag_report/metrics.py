@@ -271,18 +271,17 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
         )
         for wheel, *_ in run.channels
     }
-    delay = latencies(run)
-    delays = np.array([math.nan]) if delay is None else delay['value']
-    prompt = latencies(run, first=True)
-    valid = ((name, each) for name, each in run.timing.items() if name not in run.untrusted)
-    missing = {name: timing.missing for name, timing in valid}
+    delays = latencies(run)
+    missing = {
+        name: each.missing for name, each in run.timing.items() if name not in run.untrusted
+    }
     incidents = find_incidents(run)
     verdict = judge(
         run,
         incidents,
         counted=max(each.overall.seconds for each in wheels.values()),
         missing=missing.get(ODOMETRY, math.nan),
-        latency_99=math.nan if prompt is None else float(np.percentile(prompt['value'], 99.0)),
+        latency_99=_percentile(latencies(run, first=True), 99.0),
     )
     distance = tracking_errors.path_distance(run)
     return ReportMetrics(
@@ -291,16 +290,18 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
         messages=messages,
         wheels=wheels,
         responses=responses(run),
-        latency=float(np.percentile(delays, 50.0)),
-        latency_99=float(np.percentile(delays, 99.0)),
+        latency=_percentile(delays, 50.0),
+        latency_99=_percentile(delays, 99.0),
         missing=missing,
         verdict=verdict,
         incidents=incidents,
         path_error=math.nan if distance is None else rms(distance['value']),
-        path_error_99=(
-            math.nan if distance is None else float(np.percentile(distance['value'], 99.0))
-        ),
+        path_error_99=_percentile(distance, 99.0),
     )
+
+
+def _percentile(series: Series | None, percent: float) -> float:
+    return math.nan if series is None else float(np.percentile(series['value'], percent))
 
 
 def responses(run: Run) -> Mapping[str, ResponseFit]:

@@ -133,8 +133,7 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
     series = tracking_errors.tracking_error(run, run.measured) if known else None
     if not is_long(series):
         return
-    moving = tracking_errors.driven(series.time, run)
-    calm = tracking_errors.driven_and_settled(series.time, run)
+    moving, calm = tracking_errors.counted(series.time, run)
     lines, seen = [], []
     for wheel, (name, title, _, unit) in zip(WHEELS, run.channels, strict=True):
         found, text = metrics.wheels[name], UNMEASURED

@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.recorded_run import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    driven_and_settled,
+    counted,
     path_distance,
     tracking_error,
 )
@@ -104,10 +104,10 @@ def block_errors(run: Run, name: str) -> list[float]:
         error = tracking_error(run, run.measured)
     if error is None or len(error) < 2:
         return []
-    counted = np.isfinite(error[name])
+    known = np.isfinite(error[name])
     if name != DISTANCE.name:
-        counted &= driven_and_settled(error.time, run)
-    squares = error[name][counted] ** 2
+        known &= counted(error.time, run)[1]
+    squares = error[name][known] ** 2
     size = max(1, round(BLOCK / float(np.median(np.diff(error.time)))))
     count = squares.size // size
     means: list[float] = squares[: count * size].reshape(count, size).mean(axis=1).tolist()
@@ -358,7 +358,7 @@ def _settled_extent(runs: Sequence[ComparedRun], name: str) -> tuple[float, floa
     for each in runs:
         error = tracking_error(each.run, each.run.measured)
         if error is not None:
-            rows = driven_and_settled(error.time, each.run)
+            rows = counted(error.time, each.run)[1]
             found.append(report_charts.extent_of(error, rows, [name]))
     known = [each for each in found if each is not None]
     return (min(low for low, _ in known), max(high for _, high in known)) if known else None

@@ -79,23 +79,22 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     return Series(time, errors)
 
 
-def counted_span(time: Array, run: Run) -> incidents.Span:
-    """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do."""
+def counted(time: Array, run: Run) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which stamps of an error (s) count while the robot was driven, and settled as well.
+
+    Driven is what is not before the drive has started, nor after it, nor in a stop, from
+    :data:`BRAKING` s before standstill to the end of the settling after it. Settled leaves out
+    the switches, too, as in a simulated run.
+    """
     first, last = incidents.driving(run)
     if not time.size or not first < last:
-        return math.inf, -math.inf
+        nothing = np.zeros(time.size, dtype=np.bool_)
+        return nothing, nothing
     last = min(last, float(time[-1]))
-    return counted_from(max(first, float(time[0])), last), last
-
-
-def driven(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return which stamps of an error (s) count while the robot was driven, switches included.
-
-    Each stop is left out, from :data:`BRAKING` s before standstill to the end of the settling
-    after it.
-    """
+    span = counted_from(max(first, float(time[0])), last), last
     stops = [(stop.start - incidents.BRAKING, stop.end) for stop in incidents.find_stops(run)]
-    return counted_rows(time, run.switches, *counted_span(time, run)) & apart_from(time, stops)
+    driven = counted_rows(time, run.switches, *span) & apart_from(time, stops)
+    return driven, driven & counted_rows(time, run.switches, *span, ROBOT_WINDOW)
 
 
 def apart_from(time: Array, spans: Sequence[incidents.Span]) -> NDArray[np.bool_]:
@@ -106,19 +105,13 @@ def apart_from(time: Array, spans: Sequence[incidents.Span]) -> NDArray[np.bool_
     return away
 
 
-def driven_and_settled(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return which of them are settled as well, as those of a simulated run."""
-    calm = counted_rows(time, run.switches, *counted_span(time, run), ROBOT_WINDOW)
-    return driven(time, run) & calm
-
-
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
     """Return the statistics while driven and those while driven and settled, by wheel."""
     error = None if measured in run.untrusted else tracking_error(run, measured)
     if error is None:
         nothing = statistics(np.empty(0))
         return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
-    moving, calm = driven(error.time, run), driven_and_settled(error.time, run)
+    moving, calm = counted(error.time, run)
     period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
     return {
         wheel: (statistics(error[wheel][moving], period), statistics(error[wheel][calm], period))
@@ -208,7 +201,7 @@ def settled_rmse(
     error = tracking_error(run, run.measured)
     if error is None:
         return math.nan, math.nan
-    rows = driven_and_settled(error.time, run) & (error.time < until)
+    rows = counted(error.time, run)[1] & (error.time < until)
     rows &= apart_from(error.time, spared)
     right, left = (statistics(error[each.name][rows]).rmse for each in run.channels)
     return right, left

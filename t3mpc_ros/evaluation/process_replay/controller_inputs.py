@@ -70,9 +70,8 @@ class ConsumedMessages:
     """Whether something is lost between the previous event and this one, shape (n,)."""
     restarts: Flags
     """Whether this is a reset that makes the past irrelevant, shape (n,)."""
-    lost_odometry: int
-    lost_references: int
-    lost_events: int
+    lost: Mapping[str, int]
+    """What is lost, and how often."""
 
 
 @dataclass(frozen=True)
@@ -292,17 +291,9 @@ class _SessionReader:
     def session(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
         """Return the session of these rows of the journal, which were received then."""
         taken = match(rows, self.columns[ODOMETRY].stamps_ns, self.columns[REFERENCE].stamps_ns)
-        for count, what in (
-            (int(rows[0, 0]), 'events of the controller were before the recording'),
-            (taken.lost_events, 'events are missing in the journal of the controller'),
-            (
-                taken.lost_odometry,
-                'odometry messages that the controller processed are not in the bag',
-            ),
-            (taken.lost_references, 'references that the controller received are not in the bag'),
-        ):
-            if count:
-                self.notes.append(f'{count} {what}')
+        earlier = 'events of the controller were before the recording'
+        lost = {earlier: int(rows[0, 0]), **taken.lost}
+        self.notes += [f'{count} {what}' for what, count in lost.items() if count]
         exact = np.zeros(len(rows), dtype=np.bool_)
         sound = rows[0, 0] == 0
         marks = np.flatnonzero(taken.broken | taken.restarts).tolist()
@@ -445,9 +436,13 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
         # Without a reference the robot is at rest, and only the last odometry stamp is state.
         (missing & (handed > 0)) | (gaps > 0) | (lost > 0) | (reset & late),
         reset & ~late,
-        int(np.count_nonzero(missing)),
-        int(lost.sum()),
-        int(gaps.sum()),
+        {
+            'events are missing in the journal of the controller': int(gaps.sum()),
+            'odometry messages that the controller processed are not in the bag': int(
+                np.count_nonzero(missing)
+            ),
+            'references that the controller received are not in the bag': int(lost.sum()),
+        },
     )
 
 
