@@ -23,6 +23,7 @@ import sqlite3
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
+from scipy.signal import lfilter
 from support.bag_messages import START, TYPES, diagnostics, odometry_message, twist_message
 from support.long_tests import few_of
 from support.report_run import sections_of
@@ -62,12 +63,11 @@ def drive(duration=40.0, seed=0):
     late = round(DEAD_TIME / step)
     acting = np.vstack([np.zeros((late, 2)), held])[:count]
     keep = math.exp(-step / LAG)
-    speed, pose = np.zeros((count, 2)), np.zeros((count, 3))
-    for k in range(1, count):
-        speed[k] = keep * speed[k - 1] + (1.0 - keep) * GAIN * acting[k - 1]
-        x, y, yaw = pose[k - 1]
-        v, w = speed[k] * step
-        pose[k] = x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w
+    speed = lfilter([0.0, (1.0 - keep) * GAIN], [1.0, -keep], acting, axis=0)
+    v, w = step * speed.T
+    yaw = np.cumsum(w)
+    x, y = (np.cumsum(v * each(yaw - w)) for each in (np.cos, np.sin))
+    pose = np.column_stack([x, y, yaw])
     time = step * np.arange(count)
     odom = np.arange(0, count, round(0.04 / step))
     return (time[::every], held[::every]), (time[odom], speed[odom], pose[odom])
@@ -394,6 +394,13 @@ def test_what_lasts_long_does_not_change_the_response(lasts):
 # -- several runs -------------------------------------------------------------------------------
 
 
+def compared(tmp_path, capsys, bags):
+    """Return what the comparison of bags of some rows, by name, prints."""
+    folders = [str(write(tmp_path / name, rows)) for name, rows in bags.items()]
+    assert bag_main(['report', *folders, '--output', str(tmp_path / 'out')]) == 0
+    return capsys.readouterr().out
+
+
 def uneven(t):
     """Return an error whose mean square over a run is nearly 0.02² m²/s², in blocks of 5 s."""
     return 0.032 if 6.0 < t < 11.0 else 0.01
@@ -410,13 +417,8 @@ def uneven(t):
 @pytest.mark.slow
 def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, capsys):
     """A verdict needs a difference beyond what the run itself varies by."""
-    folders = [
-        write(tmp_path / 'one', following_rows()),
-        write(tmp_path / 'two', following_rows(offset=offset)),
-    ]
-    text = [*map(str, folders), '--output', str(tmp_path / 'out')]
-    assert bag_main(['report', *text]) == 0
-    printed = capsys.readouterr().out
+    bags = {'one': following_rows(), 'two': following_rows(offset=offset)}
+    printed = compared(tmp_path, capsys, bags)
     assert f'B, two against A, one: {verdict}: right wheel: ' in printed
     assert words in printed
     page = (tmp_path / 'out' / 'comparison.html').read_text(encoding='utf-8')
@@ -426,7 +428,7 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
     kind = {'Larger': 'bad', 'Smaller': 'good'}.get(verdict.split()[0], 'apart')
     assert re.search(r'<div class="verdict (\w+)"', page)[1] == kind
     rows = dict(re.findall(r'<td[^>]*>(odometry to command, [^<]*)</td>\s*<td>([^<]*)</td>', page))
-    with open_bag(folders[0]) as recording:
+    with open_bag(tmp_path / 'one') as recording:
         one = compute_metrics(load_run(recording), Path(), recording.message_count)
     assert [float(each) for each in rows.values()] == pytest.approx(
         [1e3 * one.latency, 1e3 * one.latency_99], rel=5e-3
@@ -439,23 +441,9 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
 def test_runs_of_one_reference_may_begin_at_different_places(tmp_path, capsys):
     """Nodes discover each other sooner or later: two demos of one seed were not comparable."""
     late = [row for row in following_rows(offset=0.03) if row[1] != '/cmd_vel' or row[0] > 0.7]
-    folders = [write(tmp_path / 'one', following_rows()), write(tmp_path / 'late', late)]
-    for pair in (folders, folders[::-1]):
-        words = [*map(str, pair), '--output', str(tmp_path / 'out')]
-        assert bag_main(['report', *words]) == 0
-        assert 'er settled error: right wheel: ' in capsys.readouterr().out
-
-
-def test_errors_by_ground_truth_and_by_odometry_do_not_compare(tmp_path, capsys):
-    drive = following_rows()
-    exact = [(t, '/ground_truth/odom', m) for t, topic, m in drive if topic == '/odom']
-    made = {'simulated': sorted([*drive, *exact], key=lambda row: row[0]), 'real': drive}
-    folders = [str(write(tmp_path / name, each)) for name, each in made.items()]
-    assert bag_main(['report', *folders, '--output', str(tmp_path / 'out')]) == 0
-    assert (
-        'Not comparable: The errors of A, simulated are measured by ground_truth/odom, those of '
-        'B, real by odom.'
-    ) in capsys.readouterr().out
+    for k, pair in enumerate(((following_rows(), late), (late, following_rows()))):
+        bags = {f'{k} {name}': rows for name, rows in zip(('first', 'other'), pair, strict=True)}
+        assert 'er settled error: right wheel: ' in compared(tmp_path, capsys, bags)
 
 
 @pytest.mark.slow
@@ -470,14 +458,20 @@ def test_runs_that_cannot_be_compared_get_no_verdict(rows, tmp_path, capsys):
         for t, topic, message in drive
     ]
     other_task = [(t + 3.0, *row) for t, *row in following_rows(duration=20.0) if t > 3.0]
-    made = {'one': drive, 'stopped': stopped, 'other': other_task, 'turtlebot': rows}
-    folders = [str(write(tmp_path / name, each)) for name, each in made.items()]
-    assert bag_main(['report', *folders, '--output', str(tmp_path / 'out')]) == 0
-    printed = capsys.readouterr().out
+    exact = [(t, '/ground_truth/odom', m) for t, topic, m in drive if topic == '/odom']
+    simulated = sorted([*drive, *exact], key=lambda row: row[0])
+    bags = {'one': drive, 'stopped': stopped, 'other': other_task, 'turtlebot': rows,
+            'simulated': simulated}  # fmt: skip
+    printed = compared(tmp_path, capsys, bags)
     assert 'B, stopped against A, one: Not comparable: B, stopped: Stopped at 5.0 s.' in printed
     assert 'C, other against A, one: Not comparable: The references differ' in printed
     assert 'D, turtlebot against A, one: Not comparable: D, turtlebot: Data missing' in printed
-    assert bag_main(['report', *folders[:1] * 9, '--output', str(tmp_path / 'no')]) == 1
+    assert (
+        'Not comparable: The errors of A, one are measured by odom, those of E, simulated by '
+        'ground_truth/odom.'
+    ) in printed
+    many = [str(tmp_path / 'one')] * 9
+    assert bag_main(['report', *many, '--output', str(tmp_path / 'no')]) == 1
     assert 'a comparison must have 2 to 6 bags: got 9' in capsys.readouterr().err
 
 

@@ -69,9 +69,11 @@ def run_of(wanted, moved, commanded=None, **changes):
         ODOMETRY: motion(*moved),
         COMMAND: motion(*(wanted if commanded is None else commanded)),
     }
-    receipts = dict.fromkeys(motions, TIME)
-    whole = {'motions': motions, 'receipts': receipts, 'switches': np.empty(0), 'links': ()}
-    return replace(RUN, **(whole | {'lead': 0.0} | changes))
+    whole = {
+        'motions': motions, 'receipts': dict.fromkeys(motions, TIME), 'switches': np.empty(0),
+        'links': (), 'lead': 0.0, 'timing': {ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)},
+    }  # fmt: skip
+    return replace(RUN, **(whole | changes))
 
 
 def standing(speeds, spans):
@@ -158,7 +160,7 @@ def test_stalls_are_counted_and_jitter_is_none(seed):
         stalls.append((start, start + length))
     run = run_of(wheels(rng), wheels(rng), receipts={
         ODOMETRY: received, COMMAND: received + 0.001, REFERENCE: TIME,
-    }, timing={ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)})  # fmt: skip
+    })  # fmt: skip
     found = find_stalls(run)
     assert [start for start, _ in found] == pytest.approx([start for start, _ in stalls])
     for (_, end), (_, expected) in zip(found, stalls, strict=True):
@@ -173,8 +175,7 @@ def test_a_lost_packet_is_no_stall():
     kept = ~((TIME > 10.0) & (TIME < 10.3))
     receipts = {ODOMETRY: TIME[kept], COMMAND: TIME[kept] + 0.001, REFERENCE: TIME}
     speeds = wheels(np.random.default_rng(1))
-    timing = {ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)}
-    run = run_of(speeds, speeds, receipts=receipts, timing=timing)
+    run = run_of(speeds, speeds, receipts=receipts)
     assert find_stalls(run) == [pytest.approx((10.0, 10.3), abs=2e-3)]
     assert find_stalls(replace(run, links=RUN.links)) == []
     silent = {**receipts, REFERENCE: TIME[kept]}
@@ -187,10 +188,9 @@ def test_a_lost_packet_is_no_stall():
 
 def test_lost_commands_and_damaged_parts_are_no_stall():
     speeds = wheels(np.random.default_rng(1))
-    timing = {ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)}
     some = np.random.default_rng(2).uniform(size=TIME.size) > 0.3
     receipts = {ODOMETRY: TIME, COMMAND: TIME[some] + 0.001, REFERENCE: TIME}
-    run = run_of(speeds, speeds, receipts=receipts, timing=timing)
+    run = run_of(speeds, speeds, receipts=receipts)
     assert np.diff(TIME[some]).max() > STALL_PERIODS * 0.01
     assert find_stalls(run) == []
     kept = ~((TIME > 10.0) & (TIME < 10.3))
