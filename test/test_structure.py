@@ -78,6 +78,7 @@ LIBRARIES = {
     'parameters': {'yaml'},
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml'},
+    'mpc': {'daqp'},
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
     | {'pyarrow', 'distributed', 'cloudpickle'},
     'nodes': {'yaml'},

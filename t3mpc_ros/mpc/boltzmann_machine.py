@@ -25,7 +25,6 @@ import numpy as np
 
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.mpc.quadratic_program import cholesky, solve_lower, solve_upper
 
 
 class LayerSizes(NamedTuple):
@@ -256,6 +255,41 @@ def gradient_step(machine: BoltzmannMachine, error: float, rate: float, floor: f
         squared += machine.mu1[j] * machine.mu1[j]
     for j in range(machine.mu1.size):
         machine.output_weights[j] += rate * error / machine.scales[0] * machine.mu1[j] / squared
+
+
+@kernel
+def cholesky(matrix: Array, lower: Array) -> bool:
+    """Write the Cholesky factor of ``matrix`` into ``lower``; return False without one."""
+    for i in range(matrix.shape[0]):
+        for k in range(i + 1):
+            total = matrix[i, k]
+            for j in range(k):
+                total -= lower[i, j] * lower[k, j]
+            if i == k:
+                if not (total > 0.0 and math.isfinite(total)):
+                    return False
+                lower[i, i] = math.sqrt(total)
+            else:
+                lower[i, k] = total / lower[k, k]
+    return True
+
+
+@kernel
+def solve_lower(lower: Array, x: Array) -> None:
+    """Replace ``x`` by L⁻¹ x."""
+    for i in range(x.size):
+        for j in range(i):
+            x[i] -= lower[i, j] * x[j]
+        x[i] /= lower[i, i]
+
+
+@kernel
+def solve_upper(lower: Array, x: Array) -> None:
+    """Replace ``x`` by L⁻ᵀ x."""
+    for i in range(x.size - 1, -1, -1):
+        for j in range(i + 1, x.size):
+            x[i] -= lower[j, i] * x[j]
+        x[i] /= lower[i, i]
 
 
 @kernel

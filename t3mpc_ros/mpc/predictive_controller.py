@@ -44,11 +44,10 @@ from t3mpc_ros.mpc.pretraining import (
     simulate_excitation,
 )
 from t3mpc_ros.mpc.quadratic_program import (
-    OPTIMAL,
-    Indices,
-    Workspace,
-    make_workspace,
+    normal_equations,
     solve_quadratic_program,
+    sum_rows,
+    write_bounds,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
@@ -202,12 +201,23 @@ class Responses(NamedTuple):
     known: Array  # future errors of known jumps, rad/s
 
 
-class PlanWork(NamedTuple):
-    """Work space and results of the quadratic programs."""
+class Programs(NamedTuple):
+    """The quadratic program of each output; the first axis of every array is the output."""
 
-    matrix: Array  # S (54), shape (n_p, n_c)
-    program: Workspace
-    status: Indices  # status of each last solution, shape (outputs,)
+    matrix: Array  # S (54), shape (outputs, n_p, n_c)
+    hessian: Array  # shape (outputs, n_c, n_c)
+    gradient: Array  # shape (outputs, n_c)
+    lower: Array  # bounds of the rows, shape (outputs, 2 n_c - 1), as the next
+    upper: Array
+    v_previous: Array  # v_p(t-1), rad/s², shape (outputs,)
+    v_max: Array  # bound of v_p in this period, rad/s², shape (outputs,)
+    changes: Array  # solution dv, rad/s², shape (outputs, n_c); zero where there is none
+
+    @classmethod
+    def make(cls, outputs: int, horizon: int, moves: int) -> Self:
+        """Return empty programs."""
+        shapes = ((horizon, moves), (moves, moves), (moves,), *[(2 * moves - 1,)] * 2, (), ())
+        return cls(*(np.zeros((outputs, *shape)) for shape in (*shapes, (moves,))))
 
 
 class Signals(NamedTuple):
@@ -243,7 +253,7 @@ def accumulate_sample(
     """Add a control period to the sums of the sample; return False if an error is not finite.
 
     sampled : whether this period's errors belong to the sample
-    due     : whether the sample is complete; :func:`predictive_step` then ends the period
+    due     : whether the sample is complete; the next step then ends the period
     """
     for z in range(speeds.size):
         if not math.isfinite(speeds[z] - reference[z]):
@@ -273,35 +283,7 @@ def predict_known_errors(jump: float, decays: Array, change: Array, known: Array
 
 
 @kernel
-def plan_moves(
-    steps: Array,
-    free: Array,
-    v_previous: float,
-    v_max: float,
-    constants: MoveConstants,
-    work: PlanWork,
-    prediction: Array,
-) -> int:
-    """Write the optimal changes and the predicted errors Psi (52); return the solver's status."""
-    matrix, program = work.matrix, work.program
-    toeplitz(steps, matrix)
-    status = solve_quadratic_program(
-        matrix,
-        free,
-        constants.error_weight,
-        constants.move_weight,
-        v_previous,
-        constants.dv_max,
-        v_max,
-        20 * program.gradient.size,
-        program,
-    )
-    predicted_errors(matrix, program.changes, free, prediction)
-    return status
-
-
-@kernel
-def predictive_step(
+def prepare_programs(
     wheels: tuple[WheelState, ...],
     signals: Signals,
     responses: Responses,
@@ -309,9 +291,9 @@ def predictive_step(
     samples: int,
     constants: MoveConstants,
     learning: LearningConstants,
-    work: PlanWork,
+    programs: Programs,
 ) -> None:
-    """Process the sample of each output, and update its v_p: (34)-(63) in one call.
+    """Process the sample of each output, and write its quadratic program: (34)-(61).
 
     ``change``, shape (n_p, outputs), has the jumps in each future period T, rad/s.
     """
@@ -355,11 +337,30 @@ def predictive_step(
         signals.authorities[z] = share if constants.enabled else 0.0
         # A decreasing authority reduces v_p by at most dv_max per period, without a step.
         bound = max(signals.authorities[z] * constants.v_max, abs(v_previous) - constants.dv_max)
-        work.status[z] = plan_moves(
-            steps, free, v_previous, bound, constants, work, responses.prediction[z]
+        toeplitz(steps, programs.matrix[z])
+        normal_equations(
+            programs.matrix[z],
+            free,
+            constants.error_weight,
+            constants.move_weight,
+            programs.hessian[z],
+            programs.gradient[z],
         )
+        write_bounds(v_previous, constants.dv_max, bound, programs.lower[z], programs.upper[z])
+        programs.v_previous[z] = v_previous
+        programs.v_max[z] = bound
+
+
+@kernel
+def apply_moves(
+    signals: Signals, responses: Responses, constants: MoveConstants, programs: Programs
+) -> None:
+    """Update v_p (63) and the predicted errors (52) by the solutions; end the sample."""
+    for z in range(signals.v.size):
+        changes, bound = programs.changes[z], programs.v_max[z]
+        predicted_errors(programs.matrix[z], changes, responses.free[z], responses.prediction[z])
         # Rounding must not move v_p beyond its bound, or leave a residual when it is zero.
-        v = min(max(v_previous + work.program.changes[0], -bound), bound)
+        v = min(max(programs.v_previous[z] + changes[0], -bound), bound)
         signals.v[z] = v
         if constants.dithered:
             signals.v[z] = min(max(v + signals.next_dither[z], -constants.v_max), constants.v_max)
@@ -434,21 +435,17 @@ class PredictiveController:
             )
         self.signals = Signals(*np.zeros((len(Signals._fields), outputs)))
         """The signals, for kernels."""
-        self.known_error = self.signals.jumps
-        """Residual of the known jumps, rad/s, shape (outputs,)."""
         self.responses = Responses(*np.zeros((4, outputs, parameters.horizon)))
         self._zeros = np.zeros(outputs)
         self._no_change = np.zeros((parameters.horizon, outputs))
         moves = parameters.control_horizon
-        self._work = PlanWork(
-            np.zeros((parameters.horizon, moves)),
-            make_workspace(moves),
-            np.zeros(outputs, dtype=np.int64),
-        )
-        self.status = self._work.status
-        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
+        self._work = Programs.make(outputs, parameters.horizon, moves)
+        self._sums = sum_rows(moves)
+        self.solved = np.ones(outputs, dtype=np.bool_)
+        """Whether the last program of each output had a solution; without one v_p is held."""
         self._accumulate_sample = TypedKernel(accumulate_sample)
-        self._step_kernel = TypedKernel(predictive_step)
+        self._prepare_programs = TypedKernel(prepare_programs)
+        self._apply_moves = TypedKernel(apply_moves)
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
@@ -475,7 +472,7 @@ class PredictiveController:
             self._loop,
             self._timing,
             self._learning,
-            self.status.size,
+            self.solved.size,
         )
         self._predictors = copy.deepcopy(made)
         self._wheels = tuple(predictor.state for predictor in self._predictors)
@@ -486,7 +483,7 @@ class PredictiveController:
         for array in (*self.signals, *self.responses):
             array[:] = 0.0
         self._generator = np.random.default_rng((self.parameters.seed, 1))
-        self.status[:] = OPTIMAL
+        self.solved[:] = True
         self.phase = 0  # control periods since the last sample, below ``decimation``
         self.samples = 0  # number of samples
         for predictor in self._predictors:
@@ -500,7 +497,7 @@ class PredictiveController:
     def warm_up(self) -> None:
         """Compile every kernel now instead of in the first step, then :meth:`reset`."""
         for _ in range(2 * self._timing.decimation):
-            self.step(np.zeros(self.status.size))
+            self.step(np.zeros(self.solved.size))
         self.reset()
 
     def get_weights(self) -> dict[str, Array]:
@@ -557,9 +554,9 @@ class PredictiveController:
             raise ValueError(f'errors must be finite: got {speeds - reference}')
         if phase == 0:
             if self._constants.dithered:
-                next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
+                next_dither = self._generator.uniform(-1.0, 1.0, self.solved.size)
                 self.signals.next_dither[:] = self.parameters.dither * next_dither
-            self._step_kernel(
+            self._prepare_programs(
                 self._wheels,
                 self.signals,
                 self.responses,
@@ -569,9 +566,25 @@ class PredictiveController:
                 self._learning,
                 self._work,
             )
+            self._solve()
+            self._apply_moves(self.signals, self.responses, self._constants, self._work)
             self.skill = self.signals.skills.copy()
             self.samples += 1
         self.phase = (phase + 1) % timing.decimation
+
+    def _solve(self) -> None:
+        """Write the changes that solve each program, and whether there were any."""
+        programs = self._work
+        for z in range(self.solved.size):
+            changes = solve_quadratic_program(
+                programs.hessian[z],
+                programs.gradient[z],
+                self._sums,
+                programs.lower[z],
+                programs.upper[z],
+            )
+            self.solved[z] = changes is not None
+            programs.changes[z] = 0.0 if changes is None else changes
 
     @property
     def due(self) -> bool:

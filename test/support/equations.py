@@ -27,7 +27,7 @@ from t3mpc_ros.fuzzy.inference import LOWER, UPPER, FuzzySets, fuzzify, square_d
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.mpc.quadratic_program import solve_lower, solve_upper
+from t3mpc_ros.mpc.boltzmann_machine import solve_lower, solve_upper
 from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor, wheel_inertia
 
 Array = npt.NDArray[np.float64]

@@ -247,7 +247,7 @@ def drive_predictive(controller, r):
     for k in range(130):
         found.append(controller.step(np.array([math.sin(0.05 * k), 1.0]) + 0.02 * pair(r, 1.0)))
         found += [controller.skill, *map(np.copy, (*controller.signals, *controller.responses))]
-        found += properties(controller, 'known_error', 'due', 'status')
+        found += properties(controller, 'due', 'solved')
         if r.random() < 0.1:
             controller.signals.applied[:] = 0.5 * found[0]
         if r.random() < 0.03:

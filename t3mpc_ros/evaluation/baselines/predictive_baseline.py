@@ -13,9 +13,8 @@
 # limitations under the License.
 """Base of the predictive baselines: common parameters, wheel model, expected reference, program.
 
-The quadratic programs have bounds on each move alone. They are solved by DAQP, a dual active-set
-solver (Arnström, Bemporad and Axehill 2022, doi 10.1109/TAC.2022.3176430), from the active bounds
-of the step before.
+The quadratic programs have bounds on each move alone. They are solved by DAQP, as that of v_p in
+:mod:`t3mpc_ros.mpc.quadratic_program`, but from the active bounds of the step before.
 """
 
 from dataclasses import dataclass

@@ -129,7 +129,7 @@ def _replayed(
         same = all(abs(a - b) <= AGREES for a, b in zip(twist, sent, strict=True)) and exact[row]
         if not same and math.isfinite(sum(sent)):  # after a message that the bag lacks
             drive.set_command(np.array(wheels_from_twist(sent, parameters.geometry)))
-        terms, known = status.terms, controller.law.predictive.known_error
+        terms, known = status.terms, controller.law.predictive.signals.jumps
         rows.append(
             (
                 -terms[_FEEDBACK] / parameters.law.gain - revive * known,
