@@ -310,10 +310,8 @@ def rls_step(
     pretrained weights* X_o^0, by ``forgetting``, lambda per step. X_o minimises the sum of
     g lambda^(t-i) (delta_i - X_oᵀ mu_1i)² plus |X_o - X_o^0|² in the metric R_0. Without
     excitation X_o returns to X_o^0, whereas plain forgetting loses information and then bursts.
-    The
-    lags of a slow signal are nearly parallel, so a scalar gamma needs thousands of steps where
-    this
-    needs dozens. The weight g = (mean |mu_1|² in pretraining) / (recent mean |mu_1|²) is the
+    The lags of a slow signal are nearly parallel, so a scalar gamma needs thousands of steps where
+    this needs dozens. The weight g = (mean |mu_1|² in pretraining) / (recent mean |mu_1|²) is the
     normalisation.
     """
     n = machine.mu1.size

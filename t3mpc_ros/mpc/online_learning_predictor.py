@@ -106,8 +106,7 @@ def toeplitz(step: Array, out: Array) -> None:
     """Write S, the lower-triangular Toeplitz matrix of the step response, (54) with E11.
 
     E11: the printed last row repeats s_{n_p-1}; it is s_{n_p-1}, s_{n_p-2}, ..., s_0. Changes
-    after
-    n_c periods are zero.
+    after n_c periods are zero.
     """
     for j in range(out.shape[0]):
         for i in range(out.shape[1]):

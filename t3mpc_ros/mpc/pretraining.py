@@ -93,8 +93,7 @@ def contrastive_divergence_epoch(
     """Learn from every instant of a run by (43), oldest first, and write each mu_1.
 
     Errors and moves are newest first, NaN where unknown; row i of the features belongs to
-    errors[i],
-    and is NaN if a lag is unknown.
+    errors[i], and is NaN if a lag is unknown.
     """
     n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
     for i in range(features.shape[0] - 1, -1, -1):
@@ -205,9 +204,8 @@ def simulate_nominal_loop(
     """Write the measured errors of the nominal loop, one per predictive period.
 
     The matrices are the transitions of (delta, a) over the first part of a control period, in
-    which
-    the older v_p acts, and over the rest. Moves are per predictive, disturbance and noise per
-    control period; the dead time has ``whole_delay`` control periods.
+    which the older v_p acts, and over the rest. Moves are per predictive period, disturbance and
+    noise per control period; the dead time has ``whole_delay`` control periods.
     """
     delta, actuator = 0.0, 0.0
     errors[:] = 0.0

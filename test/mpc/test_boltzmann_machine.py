@@ -63,6 +63,10 @@ def _missed(machine, errors, moves, rows=None):
         yield errors[i] - predict_error(machine)
 
 
+def _states(count):
+    return [np.array(state) for state in itertools.product((-1.0, 1.0), repeat=count)]
+
+
 def _slope(function, weights, step=1e-6):
     """Return the gradient of a function of X_v by central differences."""
     out = np.zeros_like(weights)
@@ -113,8 +117,7 @@ def test_cd_step_estimates_the_likelihood_gradient():
 
 def _likelihood(weights, data):
     """Return the mean ln J' of visible states, by enumerating every state of (41)."""
-    visible = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[0])]
-    hidden = [np.array(s) for s in itertools.product((-1.0, 1.0), repeat=weights.shape[1])]
+    visible, hidden = (_states(count) for count in weights.shape)
     energies = np.array([[energy(weights, eta, mu) for mu in hidden] for eta in visible])
     probability = boltzmann_distribution(energies).sum(axis=1)
     index = {tuple(eta): i for i, eta in enumerate(visible)}
@@ -313,14 +316,6 @@ def test_invalid_runs_are_rejected():
 SMALL = LayerSizes(3, 2, 7)
 
 
-def _small_machine(seed=0, shape=SMALL, spread=1.0):
-    return _machine(seed, shape, spread)
-
-
-def _states(count):
-    return [np.array(state) for state in itertools.product((-1.0, 1.0), repeat=count)]
-
-
 def test_sigmoid_is_the_printed_fraction_without_overflow():
     for y in (-30.0, -2.0, -1e-9, 0.0, 0.3, 5.0, 30.0):
         printed = (1.0 - np.exp(-y)) / (1.0 + np.exp(-y))
@@ -330,7 +325,7 @@ def test_sigmoid_is_the_printed_fraction_without_overflow():
 
 
 def test_passes_run_in_the_order_39_38_37_36():
-    machine = _small_machine()
+    machine = _machine(shape=SMALL)
     generator = np.random.default_rng(1)
     machine.output_weights[:] = generator.standard_normal(7)
     machine.lags[:] = generator.uniform(-1.0, 1.0, 5)
@@ -345,14 +340,14 @@ def test_passes_run_in_the_order_39_38_37_36():
 
 
 def test_visible_vector_contains_scaled_lags():
-    machine = _small_machine()
+    machine = _machine(shape=SMALL)
     errors, moves = np.arange(1.0, 7.0), 10.0 * np.arange(1.0, 7.0)
     set_visible(machine, errors, moves, 1)
     np.testing.assert_allclose(machine.lags, [2 / 3, 3 / 3, 4 / 3, 20 / 20, 30 / 20])
 
 
 def test_huge_inputs_are_limited_and_predictions_finite():
-    machine = _small_machine()
+    machine = _machine(shape=SMALL)
     machine.output_weights[:] = 1.0
     set_visible(machine, np.array([1e300, -1e300, 0.0]), np.array([1e308, -1e308]), 0)
     assert np.max(np.abs(machine.lags)) == 10.0
@@ -362,13 +357,13 @@ def test_huge_inputs_are_limited_and_predictions_finite():
 def test_initial_weights_have_orthogonal_rows():
     """With independent random weights the condition number is raised to the third power."""
     for spread in (0.3, 1.0, 2.0):
-        weights = _small_machine(spread=spread).visible_weights
+        weights = _machine(shape=SMALL, spread=spread).visible_weights
         np.testing.assert_allclose(weights @ weights.T, spread**2 * np.eye(5), atol=1e-13)
 
 
 def test_sigmoid_is_the_mean_of_a_hidden_unit():
     """E9: only at temperature 2 the passes (37), (39) are means of the distribution (41)."""
-    machine = _small_machine(shape=LayerSizes(2, 2, 4), spread=1.5)
+    machine = _machine(shape=LayerSizes(2, 2, 4), spread=1.5)
     for eta in _states(4):
         states = _states(4)
         energies = np.array([energy(machine.visible_weights, eta, mu) for mu in states])
@@ -388,7 +383,7 @@ def test_probability_ratios_follow_boltzmann_for_any_energy():
 
 
 def test_free_energy_sums_over_every_hidden_state():
-    machine = _small_machine(shape=LayerSizes(2, 2, 5), spread=1.7)
+    machine = _machine(shape=LayerSizes(2, 2, 5), spread=1.7)
     eta = np.array([0.3, -0.9, 1.0, 0.1])
     mu = np.linspace(-1.0, 1.0, 5)
     assert energy(machine.visible_weights, eta, mu) == pytest.approx(
