@@ -58,8 +58,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
 from t3mpc_ros.simulation.world import MovingDisc, cast_rays, clearance, grip_at, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
-CAPACITY = 1000
-"""Commands in transit at most: 2 s at 500 Hz."""
+CAPACITY = 1000  # commands in transit at most: 2 s at 500 Hz
 _NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
 
 
@@ -92,8 +91,7 @@ class DigitalTwinParameters(PaperRobotParameters):
     wheel_separation_multiplier: float = parameter(
         1.0, 'true over nominal wheel separation', bounds=(0.8, 1.25)
     )
-    boot_time: ClassVar[float] = 0.5
-    """Restart time of the board after a power loss, s, assumed."""
+    boot_time: ClassVar[float] = 0.5  # restart time of the board after a power loss, s, assumed
     slip_stop: float = parameter(
         1.0,
         'longest disagreement of gyro and steps; beyond it the robot stops until no motion is '
@@ -163,18 +161,12 @@ class DigitalTwinParameters(PaperRobotParameters):
 class TwinDiagnostics:
     """True internal values of the twin, for diagnostics and figures."""
 
-    faults: tuple[str, ...]
-    """Active faults, as text."""
-    slid: tuple[float, float]
-    """distance slid by each tyre, m, right first"""
-    load_angles: tuple[float, float]
-    """angles of the fields ahead of the rotors, rad"""
-    gyro_bias: float
-    """true gyro bias, rad/s"""
-    estimated_bias: float
-    """gyro bias estimated by the odometry, rad/s"""
-    max_contact_force: float
-    """largest contact force of a wall so far, N"""
+    faults: tuple[str, ...]  # active faults, as text
+    slid: tuple[float, float]  # distance slid by each tyre, m, right first
+    load_angles: tuple[float, float]  # angles of the fields ahead of the rotors, rad
+    gyro_bias: float  # true gyro bias, rad/s
+    estimated_bias: float  # gyro bias estimated by the odometry, rad/s
+    max_contact_force: float  # largest contact force of a wall so far, N
 
 
 class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
@@ -220,8 +212,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             load_schedule(parameters.faults.schedule) if schedule is None else schedule
         )
         self._faults = parameters.faults
-        self._boots_until = 0
-        """Integration step at which the board has restarted."""
+        self._boots_until = 0  # integration step at which the board has restarted
         self._slip_monitor = SlipMonitor()
         self._measured = interface.ZERO_WHEEL_SPEEDS
         self._measured_at = 0

@@ -45,8 +45,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         frequency = Fraction(parameters.rate) * substeps / NANOSECONDS
         self._top, self._bottom = frequency.as_integer_ratio()
         self._origin_ns: int | None = None
-        self._steps_since_origin = 0
-        """Integration steps since the origin of the time grid."""
+        self._steps_since_origin = 0  # integration steps since the origin of the time grid
         self._reached_ns = 0
         self._reports: deque[RobotState] = deque(maxlen=1024)
         """The newest state, and older ones that were not requested yet."""

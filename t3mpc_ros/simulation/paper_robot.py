@@ -37,8 +37,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._measured = interface.ZERO_WHEEL_SPEEDS
         self._torque = (0.0, 0.0)
         self._limited_command = self._limiter.advance(0, 0.0)
-        self._measured_at = 0
-        """Integration steps at the last measurement."""
+        self._measured_at = 0  # integration steps at the last measurement
         self._apply_parameters()
         self._reports.append(self._make_state(0))
 

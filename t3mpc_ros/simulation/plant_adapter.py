@@ -82,12 +82,9 @@ class Plant(Protocol):
 class LinkDelay(NamedTuple):
     """What a link does to commands from ``begin`` to ``end`` (s)."""
 
-    delay: float = 0.0
-    """s"""
-    jitter: float = 0.0
-    """Largest addition to it, s."""
-    loss: float = 0.0
-    """Share of the commands that is lost."""
+    delay: float = 0.0  # s
+    jitter: float = 0.0  # largest addition to it, s
+    loss: float = 0.0  # share of the commands that is lost
     begin: float = 0.0
     end: float = math.inf
 

@@ -35,10 +35,8 @@ from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters import yaml_loader
 from t3mpc_ros.parameters.table import nearest_hint
 
-WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
-"""Folder of the bundled worlds."""
-MAX_COORDINATE = 1000.0
-"""m, bound of every coordinate and size."""
+WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'  # folder of the bundled worlds
+MAX_COORDINATE = 1000.0  # m, bound of every coordinate and size
 MIN_SIZE = 0.01
 """m, lower bound of every size: a thinner obstacle would push the bumper on both sides."""
 MAX_SEGMENTS = 2000
@@ -47,12 +45,9 @@ MAX_CIRCLES = 500
 MAX_PATCHES = 100
 MAX_MOVING = 100
 MAX_CHARGERS = 20
-MAX_CURRENT = 100.0
-"""A, of a charger."""
-MAX_SPEED = 5.0
-"""m/s, of a disc that moves."""
-JOIN_TOLERANCE = 1e-4
-"""m: ends nearer than this to each other, or to a wall, touch."""
+MAX_CURRENT = 100.0  # A, of a charger
+MAX_SPEED = 5.0  # m/s, of a disc that moves
+JOIN_TOLERANCE = 1e-4  # m: ends nearer than this to each other, or to a wall, touch
 
 
 class WorldError(ValueError):
@@ -62,22 +57,14 @@ class WorldError(ValueError):
 class MovingDisc(NamedTuple):
     """A round obstacle that follows a polyline at one speed, and stays at its end."""
 
-    radius: float
-    """m"""
-    points: Array
-    """m, shape (n, 2)"""
-    speed: float
-    """m/s"""
-    start: float
-    """Time at which it leaves its first point, s."""
-    appears: float
-    """Time before which it is nowhere, s."""
-    vanishes: float = math.inf
-    """Time from which on it is nowhere, s."""
-    repeat: bool = False
-    """Whether it goes back and forth."""
-    unseen: bool = False
-    """Whether the range sensors do not see it."""
+    radius: float  # m
+    points: Array  # m, shape (n, 2)
+    speed: float  # m/s
+    start: float  # time at which it leaves its first point, s
+    appears: float  # time before which it is nowhere, s
+    vanishes: float = math.inf  # time from which on it is nowhere, s
+    repeat: bool = False  # whether it goes back and forth
+    unseen: bool = False  # whether the range sensors do not see it
 
     def position(self, time: float) -> tuple[float, float]:
         """Return where its centre is at a time (s), m."""
@@ -99,16 +86,13 @@ class World:
     name: str
     segments: Array
     """Wall segments, shape (n, 4): ax, ay, bx, by, m; those of boxes included."""
-    circles: Array
-    """Pillars, shape (m, 3): x, y, radius, m."""
+    circles: Array  # pillars, shape (m, 3): x, y, radius, m
     patches: Array
     """Slippery floor, shape (k, 4): x, y, radius (m), grip (factor on the tyre grip, 0 to 1)."""
     boxes: Array
     """Interior of the boxes, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
-    unseen: Obstacles = Obstacles()
-    """Which of them the range sensors do not see."""
-    moving: tuple[MovingDisc, ...] = ()
-    """They are in :attr:`circles` of :meth:`at` only."""
+    unseen: Obstacles = Obstacles()  # which of them the range sensors do not see
+    moving: tuple[MovingDisc, ...] = ()  # they are in :attr:`circles` of :meth:`at` only
     chargers: Array = field(default_factory=lambda: np.zeros((0, 4)))
     """Floor on which a battery is charged, shape (k, 4): x, y, radius (m), current (A)."""
 

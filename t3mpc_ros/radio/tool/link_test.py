@@ -25,8 +25,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status, decode_uplink, encode
 from t3mpc_ros.radio.tool import procedure
 
-REPLY_TIMEOUT = 0.25
-"""Fifteen retransmissions at 250 kbit/s take 60 ms, s."""
+REPLY_TIMEOUT = 0.25  # fifteen retransmissions at 250 kbit/s take 60 ms, s
 PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
 STEP = 2  # row of the link test in the checklist of docs/robot.md
 _MAX_USB_ROUND_TRIP = 5e-3  # s; PING and PONG take 0.7 ms on the line

@@ -52,8 +52,7 @@ class BumperParameters(Parameters):
     stiffness: ClassVar[float] = 2e4
     """Force per depth, N/m, assumed. Without damping a robot of 1.5 kg at 0.5 m/s reaches a depth
     of 4.3 mm and leaves the wall after 27 ms."""
-    damping: ClassVar[float] = 100.0
-    """Force per closing speed, N s/m, assumed."""
+    damping: ClassVar[float] = 100.0  # force per closing speed, N s/m, assumed
 
     def constants(self) -> Bumper:
         """Return the argument of :func:`contact_force`."""

@@ -49,8 +49,7 @@ class DisturbanceParameters(Parameters):
         'Hz',
         (0.0, 100.0),
     )
-    walk_share: ClassVar[float] = 0.3
-    """Part of the bound that a random walk uses, assumed."""
+    walk_share: ClassVar[float] = 0.3  # part of the bound that a random walk uses, assumed
     walk_rate: float = parameter(
         0.5,
         'standard deviation of the walk after one second, relative to its part of the bound',
@@ -76,27 +75,19 @@ class NoiseParameters(Parameters):
 class FrictionConstants(NamedTuple):
     """Friction of a wheel, for kernels."""
 
-    viscous: float
-    """N m s/rad"""
-    coulomb: float
-    """N m"""
-    width: float
-    """rad/s"""
+    viscous: float  # N m s/rad
+    coulomb: float  # N m
+    width: float  # rad/s
 
 
 class DisturbanceSignals(NamedTuple):
     """Disturbance torques of both wheels, for kernels."""
 
-    bound: float
-    """N m"""
-    walk_share: float
-    """Part of the bound used by the walk."""
-    angular: Array
-    """Angular frequencies of the sines, rad/s, shape (n,)."""
-    phases: Array
-    """Phases of each wheel, rad, shape (2, n)."""
-    walk: Array
-    """Random walk of each wheel, in [-1, 1], shape (2,)."""
+    bound: float  # N m
+    walk_share: float  # part of the bound used by the walk
+    angular: Array  # angular frequencies of the sines, rad/s, shape (n,)
+    phases: Array  # phases of each wheel, rad, shape (2, n)
+    walk: Array  # random walk of each wheel, in [-1, 1], shape (2,)
 
 
 def friction_constants(parameters: FrictionParameters, factor: float) -> FrictionConstants:

@@ -64,10 +64,8 @@ Integers = npt.NDArray[np.int64]
 _NO_OBSTACLES = Obstacles(np.zeros((0, 4)), np.zeros((0, 3)))
 ROLLING = 0
 """Mode of a rolling tyre; +1 and -1: it slides and pushes the body in that direction."""
-GRAVITY = 9.81
-"""m/s²"""
-BLOCKED_INERTIA = 1e9
-"""Inertia (kg m²) of a blocked wheel: large enough to be immovable."""
+GRAVITY = 9.81  # m/s²
+BLOCKED_INERTIA = 1e9  # inertia (kg m²) of a blocked wheel: large enough to be immovable
 
 
 @dataclass(frozen=True)
@@ -90,8 +88,7 @@ class Load(NamedTuple):
     friction_factor: float
     tyres: TyreParameters
     grip_factor: float
-    blocked: tuple[bool, bool]
-    """Blocked wheels, right first."""
+    blocked: tuple[bool, bool]  # blocked wheels, right first
     radius_multipliers: tuple[float, float] = (1.0, 1.0)
     """True wheel radii over the nominal one, right first."""
 
@@ -99,11 +96,9 @@ class Load(NamedTuple):
 class PulseTarget(NamedTuple):
     """Target of the pulse generator."""
 
-    right: float
-    """pulses/s"""
+    right: float  # pulses/s
     left: float
-    reach: float
-    """Largest change of a rate, pulses/s²."""
+    reach: float  # largest change of a rate, pulses/s²
     volts: float
     """Supply; 0 = no power, the rotors turn freely."""
 
@@ -123,14 +118,12 @@ class Drivetrain:
         share: float,
     ) -> None:
         self.step = step
-        self.steps_done = 0
-        """Integration steps since the start: the time base of the disturbances."""
+        self.steps_done = 0  # integration steps since the start: the time base of the disturbances
         self._microstep = motor.microstep
         self._cycle = 2.0 * math.pi / motor.teeth
         self._bumper = bumper
         self._radius = bumper.radius
-        self.world = world
-        """Replaceable: its obstacles may move."""
+        self.world = world  # replaceable: its obstacles may move
         self._share = share
         self._arrays = DrivetrainArrays(
             state=np.zeros(9),
@@ -350,18 +343,12 @@ def max_rate(motor: StepperMotorParameters, load: Load, bumper: BumperParameters
 class Body(NamedTuple):
     """Constants of the body, for kernels."""
 
-    radius: float
-    """R, m"""
-    turn: float
-    """R/(2b)"""
-    diagonal: float
-    """Diagonal entry of (11) without the wheels' own inertia, kg m²."""
-    beside: float
-    """Off-diagonal entry of (11), kg m²."""
-    coriolis: float
-    """c of (12), kg m²"""
-    offset: float
-    """Distance of the centre of mass ahead of the axle, m."""
+    radius: float  # R, m
+    turn: float  # R/(2b)
+    diagonal: float  # diagonal entry of (11) without the wheels' own inertia, kg m²
+    beside: float  # off-diagonal entry of (11), kg m²
+    coriolis: float  # c of (12), kg m²
+    offset: float  # distance of the centre of mass ahead of the axle, m
 
 
 class DrivetrainConstants(NamedTuple):
@@ -371,31 +358,23 @@ class DrivetrainConstants(NamedTuple):
     friction: FrictionConstants
     bumper: Bumper
     motor: StepperMotor
-    microstep: float
-    """rad"""
-    share: float
-    """Of the IMU filter."""
-    step: float
-    """s"""
-    wider_right: float
-    """True over nominal radius of the right wheel."""
+    microstep: float  # rad
+    share: float  # of the IMU filter
+    step: float  # s
+    wider_right: float  # true over nominal radius of the right wheel
     wider_left: float
 
 
 class StepInputs(NamedTuple):
     """What acts on the rotors within a step."""
 
-    rate_right: float
-    """Mean of the pulse rate, pulses/s."""
+    rate_right: float  # mean of the pulse rate, pulses/s
     rate_left: float
-    position_right: float
-    """Mean position of the field, pulses."""
+    position_right: float  # mean position of the field, pulses
     position_left: float
-    peak_right: float
-    """Pull-out torque, N m."""
+    peak_right: float  # pull-out torque, N m
     peak_left: float
-    against_right: float
-    """Disturbance torque, N m."""
+    against_right: float  # disturbance torque, N m
     against_left: float
 
 
@@ -405,17 +384,14 @@ class DrivetrainArrays(NamedTuple):
     state: Array
     """See :func:`state_derivative`, shape (9,); wheel angles and chi are those of the rotors
     times the radius multipliers."""
-    modes: Integers
-    """See :data:`ROLLING`, shape (2,)."""
+    modes: Integers  # see :data:`ROLLING`, shape (2,)
     field: Array
     """Phase (pulses), rate (pulses/s), position of pulse 0 (rad), right first, shape (6,)."""
-    filtered: Array
-    """Filter of the IMU, see :func:`low_pass`, shape (3, 2)."""
+    filtered: Array  # filter of the IMU, see :func:`low_pass`, shape (3, 2)
     totals: Array
     """Accumulated, shape (4,): distance (m) slid by each tyre, work (J) of the fields; largest
     force (N) of a wall."""
-    work: Array
-    """Work space, shape (4, 9)."""
+    work: Array  # work space, shape (4, 9)
 
 
 def body_constants(body: BodyParameters, geometry: WheelGeometry) -> Body:

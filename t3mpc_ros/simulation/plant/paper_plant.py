@@ -191,10 +191,8 @@ class PaperPlant:
             parameters.disturbance, np.random.default_rng(for_disturbance)
         )
         self._noise = SpeedNoise(parameters.noise, np.random.default_rng(for_noise))
-        self.step = parameters.step
-        """Length of an integration step, s."""
-        self.steps_done = 0
-        """Integration steps since the start: the time base of the disturbances."""
+        self.step = parameters.step  # length of an integration step, s
+        self.steps_done = 0  # integration steps since the start: the time base of the disturbances
         self._torque_mode = parameters.drive.kind == 'torque'
         self._arrays = PlantArrays(
             state=np.zeros(7),
@@ -274,42 +272,30 @@ class PaperPlant:
 class DriveConstants(NamedTuple):
     """Constants of the drive, for kernels."""
 
-    diagonal: float
-    """Diagonal entry of the nominal (11), kg m²."""
-    beside: float
-    """Off-diagonal entry of the nominal (11), kg m²."""
-    lag: float
-    """s"""
-    acceleration: float
-    """rad/s², 0 = no limit."""
-    torque_limit: float
-    """N m"""
-    speed_ceiling: float
-    """rad/s"""
+    diagonal: float  # diagonal entry of the nominal (11), kg m²
+    beside: float  # off-diagonal entry of the nominal (11), kg m²
+    lag: float  # s
+    acceleration: float  # rad/s², 0 = no limit
+    torque_limit: float  # N m
+    speed_ceiling: float  # rad/s
 
 
 class PlantConstants(NamedTuple):
     """Constants of :func:`integrate_plant`."""
 
     drive: DriveConstants
-    dynamics: Array
-    """See :func:`dynamics_vector`."""
+    dynamics: Array  # see :func:`dynamics_vector`
     friction: FrictionConstants
 
 
 class PlantArrays(NamedTuple):
     """State of :func:`integrate_plant`, changed in place."""
 
-    state: Array
-    """x, y (m), P, theta_R, theta_L (rad), chi (rad/s), shape (7,)."""
-    commands: Array
-    """Delayed wheel speeds, shape (n, 2), see :func:`delay_command`."""
-    cursor: npt.NDArray[np.int64]
-    """The next row of ``commands``, shape (1,)."""
-    limited: Array
-    """Delayed command after the acceleration limit, shape (2,)."""
-    work: Array
-    """Work space, shape (3, 7)."""
+    state: Array  # x, y (m), P, theta_R, theta_L (rad), chi (rad/s), shape (7,)
+    commands: Array  # delayed wheel speeds, shape (n, 2), see :func:`delay_command`
+    cursor: npt.NDArray[np.int64]  # the next row of ``commands``, shape (1,)
+    limited: Array  # delayed command after the acceleration limit, shape (2,)
+    work: Array  # work space, shape (3, 7)
 
 
 def max_rate(parameters: PaperRobotParameters) -> float:

@@ -32,20 +32,13 @@ _MOTOR = '17HS4401 data sheet'
 class StepperMotor(NamedTuple):
     """Constants of a motor, for kernels."""
 
-    teeth: float
-    """N, stable positions per turn."""
-    torque_constant: float
-    """N m/A"""
-    resistance: float
-    """Ohm"""
-    inductance: float
-    """H"""
-    current: float
-    """Set in the driver, A."""
-    damping: float
-    """N m s/rad"""
-    damping_width: float
-    """rad/s"""
+    teeth: float  # N, stable positions per turn
+    torque_constant: float  # N m/A
+    resistance: float  # Ohm
+    inductance: float  # H
+    current: float  # set in the driver, A
+    damping: float  # N m s/rad
+    damping_width: float  # rad/s
 
 
 @dataclass(frozen=True)

@@ -82,12 +82,9 @@ class SimulatedBattery:
 
     def __init__(self, parameters: SimulatedBatteryParameters) -> None:
         self.parameters = parameters
-        self.charge = parameters.charge
-        """Remaining charge, 0 to 1."""
-        self.voltage = 0.0
-        """Terminal voltage under the load of the last draw, V."""
-        self.low = False
-        """Whether the battery should be charged."""
+        self.charge = parameters.charge  # remaining charge, 0 to 1
+        self.voltage = 0.0  # terminal voltage under the load of the last draw, V
+        self.low = False  # whether the battery should be charged
         self.collapsed = False
         """Whether the voltage is, or within the hysteresis was, too low for drivers and board."""
         self.draw(0.0, 0.0)

@@ -38,8 +38,7 @@ from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters, decode_rang
 
 # Least squares through figure 2, in relative errors.
 _SLOPE, _SHIFT, _FLOOR = 0.282, 0.0257, 0.061  # V m, m, V: from 10 to 80 cm
-NOT_CONVERTED = 0xFFFF
-"""In place of a count of the converter."""
+NOT_CONVERTED = 0xFFFF  # in place of a count of the converter
 _EDGE, _POWER, _SHARPNESS = 0.0558, 1.63, 7.0  # m, 1, 1: from 1 to 8 cm
 
 
@@ -62,10 +61,8 @@ class SimulatedRangeSensorParameters(RangeSensorParameters):
         (0.0, 0.5),
         dynamic=True,
     )
-    adc_bits: ClassVar[int] = 10
-    """Resolution of the converter of an ATmega."""
-    adc_reference: ClassVar[float] = 5.0
-    """Full-scale voltage of the converter, V: its supply."""
+    adc_bits: ClassVar[int] = 10  # resolution of the converter of an ATmega
+    adc_reference: ClassVar[float] = 5.0  # full-scale voltage of the converter, V: its supply
 
     @property
     def adc_steps(self) -> int:
