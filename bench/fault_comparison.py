@@ -68,8 +68,7 @@ from t3mpc_ros.simulation.fault_schedule import FaultEvent
 
 DURATION, BEGIN, NAMED = 30.0, 15.0, 5.0
 """Length of a run, begin of what does not last for the whole run, and time to name it, s."""
-MARGIN = 1.15
-"""Largest ratio to the errors of the best simple method."""
+MARGIN = 1.15  # largest ratio to the errors of the best simple method
 ROBOT = DigitalTwinParameters()  # the exact robot
 DEAD_TIME = ROBOT.drive.dead_time
 SIMPLE = FEED_FORWARD, SHAPED_IN_TIME, LMS
@@ -89,8 +88,7 @@ Send = Callable[[Any, int, RobotState], Iterable[RobotState]]
 class Fault:
     """What differs from the exact robot, or from what the controller assumes of it."""
 
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the robot."""
+    changes: Mapping[str, Any] = field(default_factory=dict)  # parameters of the robot
     events: Mapping[str, Any] = field(default_factory=dict)
     """Faults of the twin from :data:`BEGIN` on."""
     links: LinkFaults = NO_FAULTS
@@ -103,14 +101,11 @@ class Fault:
     whole periods alone."""
     body: bool = False
     """Whether the wheels do not move the body as assumed, so that the yaw rate alone counts."""
-    lasting: float = math.inf
-    """Duration of the events, s."""
-    begin: float = 2.0
-    """When the fault shows, s."""
+    lasting: float = math.inf  # duration of the events, s
+    begin: float = 2.0  # when the fault shows, s
     forward_links: LinkFaults | None = None
     """Links of feed-forward, where they differ: it has no ``rate``."""
-    comparable: tuple[str, ...] = SIMPLE
-    """Simple methods that get the same false information."""
+    comparable: tuple[str, ...] = SIMPLE  # simple methods that get the same false information
 
 
 def with_odometry(changed: Callable[[Any, int, State], Mapping[str, Any]]) -> Send:

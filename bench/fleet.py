@@ -46,8 +46,7 @@ RUNS = (
     *('processes:1', 'processes:2', 'processes:3', 'processes:4'),
     *('composed:1', 'composed:2', 'composed:4', 'composed:6', 'domains:4', 'server:4'),
 )
-SETTLING = 5.0
-"""Time from the last node's start to the begin of the measurement, s."""
+SETTLING = 5.0  # time from the last node's start to the begin of the measurement, s
 PORT_BASE, DOMAIN_PORTS = 7400, 250
 """UDP ports of a domain by the DDSI-RTPS specification (9.6.1.1); there the even ones discover."""
 SERVER_PORT = 11811
@@ -85,29 +84,20 @@ class Result(NamedTuple):
     layout: str
     robots: int
     processes: int
-    cores: float
-    """Processor time of all robots per time."""
+    cores: float  # processor time of all robots per time
     sim_robot: float
     """The same of one node, mean of the robots; of all nodes of a robot if it is composed."""
     reference_generator: float
     controller: float
     recorder: float
-    memory: float
-    """Proportional set size of a robot, MB."""
-    latency: float
-    """Median time from odometry to command, ms."""
-    latency_99: float
-    """Its 99th percentile, ms."""
-    rate: float
-    """Odometry messages a second, of 100."""
-    start_discovery: float
-    """Bytes of discovery until the begin of the measurement, MB."""
-    discovery: float
-    """Bytes of discovery afterwards, kB/s."""
-    messages: float
-    """Bytes of messages, kB/s."""
-    bag: float
-    """Volume of the bag of a robot, MB/h."""
+    memory: float  # proportional set size of a robot, MB
+    latency: float  # median time from odometry to command, ms
+    latency_99: float  # its 99th percentile, ms
+    rate: float  # odometry messages a second, of 100
+    start_discovery: float  # bytes of discovery until the begin of the measurement, MB
+    discovery: float  # bytes of discovery afterwards, kB/s
+    messages: float  # bytes of messages, kB/s
+    bag: float  # volume of the bag of a robot, MB/h
 
 
 class Traffic:

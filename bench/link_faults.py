@@ -34,14 +34,10 @@ from t3mpc_ros.nodes.robot_messages import state_warnings
 from t3mpc_ros.radio.link.actions_and_states import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
 
-PHASES = 20
-"""Trials of each fault."""
-CYCLE = 0.02
-"""Cycle of the link, s."""
-SAMPLE_NS = 50 * MS
-"""Period at which the diagnostics are read."""
-SUSPENSIONS = (0.3, 0.5, 0.9, 1.2, 2.0, 5.0, 10.0)
-"""s"""
+PHASES = 20  # trials of each fault
+CYCLE = 0.02  # cycle of the link, s
+SAMPLE_NS = 50 * MS  # period at which the diagnostics are read
+SUSPENSIONS = (0.3, 0.5, 0.9, 1.2, 2.0, 5.0, 10.0)  # s
 GEOMETRY = WheelGeometry()
 HOPS = {
     'cable': r'on the cable',
@@ -58,18 +54,12 @@ HOPS = {
 class Trial(NamedTuple):
     """What the host knew after one fault, and what had happened."""
 
-    missed: int
-    """Microsteps that the counters of the host lack, of the worse wheel."""
-    error: float
-    """Difference between the pose and that of the counted pulses, m."""
-    counted: tuple[int, int]
-    """Restarts of robot and dongle, as the host counted them."""
-    happened: tuple[int, int]
-    """The true ones."""
-    shown: Counter[str]
-    """Texts of the diagnostics, by the number of samples that had them."""
-    unknown: float
-    """Longest path that the host says it does not know, m."""
+    missed: int  # microsteps that the counters of the host lack, of the worse wheel
+    error: float  # difference between the pose and that of the counted pulses, m
+    counted: tuple[int, int]  # restarts of robot and dongle, as the host counted them
+    happened: tuple[int, int]  # the true ones
+    shown: Counter[str]  # texts of the diagnostics, by the number of samples that had them
+    unknown: float  # longest path that the host says it does not know, m
 
 
 class Fault(NamedTuple):
@@ -79,8 +69,7 @@ class Fault(NamedTuple):
     provoke: Callable[[RobotBench], None]
     hop: str = ''
     """Key of HOPS; empty: a moment is too short to name one."""
-    cable: bool = False
-    """Whether the robot is driven over its own USB."""
+    cable: bool = False  # whether the robot is driven over its own USB
 
 
 def diagnosis(bench: RobotBench) -> str:

@@ -50,14 +50,10 @@ DURATION, START = 60.0, 10.0
 """Length of a run, and begin of what counts, s."""
 REFERENCE_RATE, LEAD_NS = 50.0, 400 * MS
 """Rate and lead of the reference."""
-SAMPLE_NS = 10 * MS
-"""Period at which the true motion is compared with the reference."""
-ROBOT_TIMEOUT_NS = 500 * MS
-"""Age of a command at which the robot stops."""
-GAIN = 0.5
-"""Feedback of the ten lines: of 0.25, 0.5 and 1 the best on the calm robot."""
-AROUND_JUMP = 0.5, 1.0
-"""Times before and after a jump that a settled error leaves out, s."""
+SAMPLE_NS = 10 * MS  # period at which the true motion is compared with the reference
+ROBOT_TIMEOUT_NS = 500 * MS  # age of a command at which the robot stops
+GAIN = 0.5  # feedback of the ten lines: of 0.25, 0.5 and 1 the best on the calm robot
+AROUND_JUMP = 0.5, 1.0  # times before and after a jump that a settled error leaves out, s
 
 
 @dataclass(frozen=True)
@@ -66,23 +62,15 @@ class Toy:
 
     name: str
     rate: float = 50.0
-    lag: tuple[float, float] = (0.04, 0.12)
-    """Least and largest lag of the drive, s."""
+    lag: tuple[float, float] = (0.04, 0.12)  # least and largest lag of the drive, s
     dead_time: tuple[float, float] = (0.01, 0.06)
-    robot: dict[str, float] = field(default_factory=dict)
-    """Further fields of the robot."""
-    jitter: float = 0.0
-    """Largest deviation of a period of the odometry, as a share of it."""
-    loss: float = 0.0
-    """Share of the odometry that is lost."""
-    dropout: float = 0.0
-    """Duration of a dropout of the odometry every 5 s, s."""
-    rotation: float = 0.0
-    """Yaw of the frame of the odometry, rad."""
-    reset: float = math.inf
-    """Time between two resets of the pose, s."""
-    old: float = 0.0
-    """Age of its twist when the odometry is stamped, s."""
+    robot: dict[str, float] = field(default_factory=dict)  # further fields of the robot
+    jitter: float = 0.0  # largest deviation of a period of the odometry, as a share of it
+    loss: float = 0.0  # share of the odometry that is lost
+    dropout: float = 0.0  # duration of a dropout of the odometry every 5 s, s
+    rotation: float = 0.0  # yaw of the frame of the odometry, rad
+    reset: float = math.inf  # time between two resets of the pose, s
+    old: float = 0.0  # age of its twist when the odometry is stamped, s
 
 
 TOYS = (
@@ -112,8 +100,7 @@ def values_of(node: str) -> dict[str, Any]:
 class Node(Protocol):
     """A controller between the messages."""
 
-    period: float
-    """Of :meth:`wake`, s."""
+    period: float  # of :meth:`wake`, s
 
     def on_reference(self, state: State) -> None:
         """Take a reference."""
@@ -312,16 +299,14 @@ class Graph:
         )
 
 
-JUMP = 0.35
-"""Change of a wheel of the reference from one sample to the next that is a jump, rad/s."""
+JUMP = 0.35  # change of a wheel of the reference from one sample to the next that is a jump, rad/s
 
 
 class Errors(NamedTuple):
     """Rms error of the wheel speeds as a share of the rms of the reference."""
 
     whole: float
-    settled: float
-    """Away from the jumps of the reference."""
+    settled: float  # away from the jumps of the reference
 
 
 class Row(NamedTuple):

@@ -76,8 +76,7 @@ RUNS = {
     ),
 }  # fmt: skip
 """Commands by the page that each writes."""
-TOLD = ('e-stop', 'stalls', 'good')
-"""Recorded stories with a report."""
+TOLD = ('e-stop', 'stalls', 'good')  # recorded stories with a report
 IN_DOCS = {
     'report_1440_light': ('demo/report.html', 1440, 'light', ''),
     'report_1440_dark': ('demo/report.html', 1440, 'dark', 'switch'),

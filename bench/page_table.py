@@ -26,8 +26,7 @@ class PageTable(NamedTuple):
 
     name: str
     columns: Sequence[str]
-    count: tuple[str, int]
-    """Name and default of the number of trials of a row."""
+    count: tuple[str, int]  # name and default of the number of trials of a row
     rows: Iterable[tuple[str, Callable[[int], str]]]
     """Name of each row, and what measures it with so many trials."""
 

@@ -51,8 +51,7 @@ from t3mpc_ros.evaluation.run_record import Numbers, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.parameters.table import ParameterError, ParameterSpec, Value
 
-ALLOWED = 1.5
-"""Ratio to the error of feed-forward up to which a point is good."""
+ALLOWED = 1.5  # ratio to the error of feed-forward up to which a point is good
 DURATION, SEED = 10.0, 2001
 """Length (s) and seed of every run; the reference has no switch before 12 s."""
 LEAST = {'settled': 0.012, 'yaw_rate_settled': 0.0043}
@@ -72,10 +71,8 @@ class Judged:
     point: Point
     refused: str = ''
     failed: str = ''
-    ratio: float = 0.0
-    """Largest ratio of its errors to those of feed-forward."""
-    stopped: float = 0.0
-    """Time with a reason not to move, s."""
+    ratio: float = 0.0  # largest ratio of its errors to those of feed-forward
+    stopped: float = 0.0  # time with a reason not to move, s
 
     @property
     def bad(self) -> bool:

@@ -45,8 +45,7 @@ from t3mpc_ros.geometry.types import Array, BodyTwist, Pose
 GEOMETRY = WheelGeometry()
 TOLERANCE = 0.02
 SEEDS = (101,)
-SLOWEST = 3.0
-"""Time for a drive as a multiple of that of the shape at full speed."""
+SLOWEST = 3.0  # time for a drive as a multiple of that of the shape at full speed
 
 
 def line() -> Array:
@@ -107,14 +106,10 @@ SAMPLINGS: Mapping[str, tuple[Array, Array]] = {
 class LinearisationParameters:
     """Parameters of feedback linearisation."""
 
-    ahead: float = 0.05
-    """d, m"""
-    gain: float = 3.0
-    """k, 1/s"""
-    speed: float = 0.25
-    """m/s"""
-    acceleration: float = 0.5
-    """m/s²"""
+    ahead: float = 0.05  # d, m
+    gain: float = 3.0  # k, 1/s
+    speed: float = 0.25  # m/s
+    acceleration: float = 0.5  # m/s²
 
 
 class FeedbackLinearisation:

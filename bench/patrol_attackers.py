@@ -66,10 +66,8 @@ STEP, HORIZON = 0.25, 20
 """Interval of the observations, s, and how many of them are five seconds."""
 LAGS = (0, 1, 2, 4, 8, 12, 16)
 NEIGHBOURS = 5
-KNOWN = 0.25
-"""Error below which a place is known, m."""
-TRUSTED = 0.1
-"""Share of the moments that an attacker chooses."""
+KNOWN = 0.25  # error below which a place is known, m
+TRUSTED = 0.1  # share of the moments that an attacker chooses
 DURATION = 1080.0
 SEEDS, OTHER_SEEDS = tuple(range(141, 147)), (301, 302)
 ARENA = PortraitParameters().arena
@@ -174,12 +172,9 @@ def analogues(known: tuple[Array, Array], asked: Array) -> tuple[Array, Array]:
 class Knowledge(NamedTuple):
     """What an attacker knows of a path in five seconds."""
 
-    median: float
-    """Error, m."""
-    known: float
-    """Share of the moments known to 25 cm."""
-    trusted: float
-    """The same of the moments that he trusts most."""
+    median: float  # error, m
+    known: float  # share of the moments known to 25 cm
+    trusted: float  # the same of the moments that he trusts most
 
 
 def knowledge(predicted: tuple[Array, Array], followed: Array) -> Knowledge:

@@ -89,24 +89,19 @@ MISSING = {
 """Entries of world files that the map has and the room lacks."""
 KINDS = ('new',) * 4 + ('missing',) * 3 + ('moving',) * 3
 PLANTED_MINUTES, UNCHANGED_MINUTES = 5.0, 30.0
-APPEARS = 30.0, 90.0
-"""When a change appears, s of the drive."""
-STAYS = 60.0
-"""Time for which a person walks, s."""
+APPEARS = 30.0, 90.0  # when a change appears, s of the drive
+STAYS = 60.0  # time for which a person walks, s
 SEEN_DIFFERENCE, SEEN_WITHIN = 0.1, 0.75
 """Difference of two readings, and distance of the nearer one, with which a change is seen, m."""
-NEAR = 0.25
-"""Distance of an event from the surface of the thing up to which it is right, m."""
-WANTED_TIME = 60.0
-"""Time after the first sight within which a change is to be found, s."""
+NEAR = 0.25  # distance of an event from the surface of the thing up to which it is right, m
+WANTED_TIME = 60.0  # time after the first sight within which a change is to be found, s
 
 
 class Planted(NamedTuple):
     """A run with a change."""
 
     room: str
-    number: int
-    """0 to 9: the change, see :data:`KINDS`."""
+    number: int  # 0 to 9: the change, see :data:`KINDS`
     minutes: float = PLANTED_MINUTES
 
     @property
@@ -131,8 +126,7 @@ class Visitor:
     def __init__(self, planted: Planted, room: World) -> None:
         self._planted, self._room = planted, room
         self._generator = np.random.default_rng((planted.seed, 51))
-        self.disc: MovingDisc | None = None
-        """What has come."""
+        self.disc: MovingDisc | None = None  # what has come
 
     def __call__(self, time: float, state: State) -> MovingDisc | None:
         """Return what appears at a time of the twin (s), where it does not touch the robot."""

@@ -39,8 +39,7 @@ FIELDS = {
     'nav_msgs/msg/Odometry': 'pose.pose.position.x',
     'std_msgs/msg/Float64': 'data',
 }
-DEPTH = 1000
-"""History depth of the publishers, which covers delays of the recorder."""
+DEPTH = 1000  # history depth of the publishers, which covers delays of the recorder
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,9 @@ class BenchmarkResult:
     recorded: int
     in_order: bool
     """Whether every message of each topic was recorded once, in the order of publication."""
-    share: float
-    """Processor time of the recorder per elapsed time, 1 = one core."""
+    share: float  # processor time of the recorder per elapsed time, 1 = one core
     seconds: float
-    size: int
-    """Bytes of the bag."""
+    size: int  # bytes of the bag
 
 
 def processor_time(pid: int) -> float:

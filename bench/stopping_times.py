@@ -48,35 +48,24 @@ from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import topic_endpoints
 
-FULL = 0.35
-"""Speed with both wheels at their maximum of 10 rad/s, m/s."""
-LIMIT = 0.45
-"""Time to rest that no trial may exceed, s."""
-TIMEOUT = 0.25
-"""``cmd_vel_timeout`` of the bridge, s."""
-CREEP = 0.002
-"""Way of the rotors while they settle at the field that stands, m."""
-DURATIONS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
-"""Durations of a suspension, s."""
+FULL = 0.35  # speed with both wheels at their maximum of 10 rad/s, m/s
+LIMIT = 0.45  # time to rest that no trial may exceed, s
+TIMEOUT = 0.25  # ``cmd_vel_timeout`` of the bridge, s
+CREEP = 0.002  # way of the rotors while they settle at the field that stands, m
+DURATIONS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)  # durations of a suspension, s
 COUNTED = (0.3, 1.2, 2.0, 10.0)
 """Durations of a suspension after which the microsteps are compared, s."""
-STEP = math.tau / 3200
-"""Turn of a wheel by a microstep, rad."""
-_MAX_LAG = 0.01
-"""Lag of the emulator's time during a trial, s."""
-_SETTLING = 1.0
-"""Time observed after the last event of a trial, s."""
+STEP = math.tau / 3200  # turn of a wheel by a microstep, rad
+_MAX_LAG = 0.01  # lag of the emulator's time during a trial, s
+_SETTLING = 1.0  # time observed after the last event of a trial, s
 
 
 class Sample(NamedTuple):
     """State of the emulated robot at one update."""
 
-    wall: float
-    """Monotonic clock of this process, s."""
-    time: float
-    """Time of the emulator, s."""
-    speed: float
-    """Speed of the faster motor, rad/s."""
+    wall: float  # monotonic clock of this process, s
+    time: float  # time of the emulator, s
+    speed: float  # speed of the faster motor, rad/s
     x: float
     y: float
 
@@ -86,10 +75,8 @@ class Trial(NamedTuple):
 
     rest: float | None
     """Time from the last valid command to rest, s; None if it is not known, or did not stop."""
-    way: float
-    """Distance from there to rest, m."""
-    after: float = 0.0
-    """Distance on commands that had expired, m."""
+    way: float  # distance from there to rest, m
+    after: float = 0.0  # distance on commands that had expired, m
     missed: int | None = None
     """Microsteps that the bridge has not counted, of the worse wheel; None: not compared."""
 

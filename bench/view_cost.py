@@ -37,10 +37,8 @@ from t3mpc_ros.cli.process_group import PrivateGraph, ProcessGroup  # noqa: E402
 from t3mpc_ros.cli.view import PAGE_AT  # noqa: E402
 
 NODES = ('sim_robot', 'reference_generator', 'controller')
-PERIOD = 0.1
-"""Time between two requests of a page, s."""
-MAX_STEP = 1.0
-"""Longest time between two steps of this process that counts, s."""
+PERIOD = 0.1  # time between two requests of a page, s
+MAX_STEP = 1.0  # longest time between two steps of this process that counts, s
 
 
 class Reader:

@@ -31,12 +31,10 @@ from t3mpc_ros.evaluation.result_output import Table
 from t3mpc_ros.evaluation.run_record import RATE, START, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 
-SLOW = 0.05
-"""rad/s"""
+SLOW = 0.05  # rad/s
 RINGS = 0.4
 """Time for which the rotor of a wheel rings after a zero crossing, s: three of its periods."""
-LEFT_OUT = 0.02, 0.055, 0.08
-"""Deadbands of the commands, rad/s."""
+LEFT_OUT = 0.02, 0.055, 0.08  # deadbands of the commands, rad/s
 MICROSTEPS = 16, 8
 """Per full step; the robot has 16."""
 

@@ -21,10 +21,8 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
 
-PERIOD = 10_000_000
-"""ns"""
-LEAD = 40 * PERIOD
-"""Time by which the reference is ahead, ns."""
+PERIOD = 10_000_000  # ns
+LEAD = 40 * PERIOD  # time by which the reference is ahead, ns
 GEOMETRY = WheelGeometry()
 
 

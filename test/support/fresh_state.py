@@ -35,8 +35,7 @@ import numpy as np
 
 from t3mpc_ros.kernels import Kernel, Structure, TypedKernel
 
-SINGLY = 300
-"""Most elements of an array that are named one by one."""
+SINGLY = 300  # most elements of an array that are named one by one
 OPAQUE = (
     types.FunctionType,
     types.BuiltinFunctionType,
@@ -242,8 +241,7 @@ class Operation(NamedTuple):
     """What makes a used object as good as new."""
 
     apply: Callable[[Any], object]
-    kept: tuple[str, ...] = ()
-    """Paths that keep what they were, as the docstring says."""
+    kept: tuple[str, ...] = ()  # paths that keep what they were, as the docstring says
     continued: tuple[str, ...] = ()
     """Paths of random streams and clocks, which go on; and what follows from what is kept."""
     scratch: tuple[str, ...] = ()
@@ -310,10 +308,8 @@ class Configured(NamedTuple):
     drive: Callable[[Any, random.Random], object]
     elsewhere: tuple[str, ...] = ()
     """Beginnings of names: the entry of a part, or of the whole, shows the effect."""
-    triggers: tuple[str, ...] = ()
-    """Parameters of which the change, not the value, has an effect."""
-    late: tuple[str, ...] = ()
-    """Paths that follow the parameters in the next step."""
+    triggers: tuple[str, ...] = ()  # parameters of which the change, not the value, has an effect
+    late: tuple[str, ...] = ()  # paths that follow the parameters in the next step
     settle: Callable[[Any], object] = lambda thing: None
     """Renews what is kept on purpose when the parameters change."""
 

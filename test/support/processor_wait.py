@@ -25,8 +25,7 @@ class ProcessorTime(NamedTuple):
     """Time of a thread since its start, ns."""
 
     running: int
-    waiting: int
-    """Time in which it could have run, but had no processor."""
+    waiting: int  # time in which it could have run, but had no processor
 
 
 def thread_times(pids):

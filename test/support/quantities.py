@@ -79,10 +79,8 @@ class Quantity(NamedTuple):
     """A number with its unit, and where it stands."""
 
     section: str
-    block: str
-    """Paragraph, item of a list, or row of a table."""
-    text: str
-    """As ``numbers.yaml`` names it: ``0.25 s``."""
+    block: str  # paragraph, item of a list, or row of a table
+    text: str  # as ``numbers.yaml`` names it: ``0.25 s``
     number: str
     unit: str
 

@@ -22,12 +22,9 @@ from collections import deque
 from dataclasses import dataclass, field
 import math
 
-STEP = 0.001
-"""Integration step, s."""
-TICK = 2.0 * math.pi / 4096
-"""Resolution of the encoders, rad."""
-COMMAND_TICK = 0.01
-"""Resolution of a command, m/s and rad/s."""
+STEP = 0.001  # integration step, s
+TICK = 2.0 * math.pi / 4096  # resolution of the encoders, rad
+COMMAND_TICK = 0.01  # resolution of a command, m/s and rad/s
 
 
 @dataclass
@@ -43,12 +40,9 @@ class VelocityRobot:
     dead_time: float = 0.03
     command_tick: float = COMMAND_TICK
     """Resolution of a command, m/s and rad/s; 0: as it is."""
-    yaw_gain: float = 1.0
-    """Yaw rate as a share of that of the wheels."""
-    sideways: float = 0.0
-    """Velocity to the left that no wheel has, as on a slope, m/s."""
-    fastest: float = math.inf
-    """Limit of the wheel speeds, rad/s."""
+    yaw_gain: float = 1.0  # yaw rate as a share of that of the wheels
+    sideways: float = 0.0  # velocity to the left that no wheel has, as on a slope, m/s
+    fastest: float = math.inf  # limit of the wheel speeds, rad/s
     pose: list = field(default_factory=lambda: [0.0, 0.0, 0.0])
     speeds: list = field(default_factory=lambda: [0.0, 0.0])
     """Wheel speeds, right wheel first, rad/s."""
