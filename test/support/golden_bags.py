@@ -132,8 +132,7 @@ class RecordedController:
 START_NS = 1_700_000_000 * NANOSECONDS
 RECEIPT_DELAY = 500_000
 """ns from the stamp of an odometry message to its arrival at the controller."""
-WATCHDOG_PERIOD = 0.05
-"""s between two checks of the odometry watchdog."""
+WATCHDOG_PERIOD = 0.05  # s between two checks of the odometry watchdog
 NEVER = (math.inf, math.inf)
 
 
@@ -141,19 +140,15 @@ NEVER = (math.inf, math.inf)
 class GoldenScenario:
     """One golden run."""
 
-    seed: int
-    """Seed of reference and robot."""
+    seed: int  # seed of reference and robot
     stretches: tuple
     """Intervals in which the reference is followed, s; it switches every 12 s and between them."""
     actions: dict = field(default_factory=dict)
     """By time (s): ``enable`` (bool), ``reset`` (nothing), ``configure`` (changes)."""
     faults: tuple = ()
-    quiet_reference: tuple = NEVER
-    """Interval without reference, s."""
-    quiet_odometry: tuple = NEVER
-    """Interval without odometry, s."""
-    bad_odometry: tuple = ()
-    """Times of odometry messages that are not finite, s."""
+    quiet_reference: tuple = NEVER  # interval without reference, s
+    quiet_odometry: tuple = NEVER  # interval without odometry, s
+    bad_odometry: tuple = ()  # times of odometry messages that are not finite, s
     parameters: dict = field(default_factory=dict)
     """Parameters of the controller other than those of the stepper robot's."""
 

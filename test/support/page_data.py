@@ -62,8 +62,7 @@ def legends(browser, at):
     }
 
 
-DELAY = 0.03
-"""With which a command, which has no stamp, may have been received, s."""
+DELAY = 0.03  # with which a command, which has no stamp, may have been received, s
 
 
 def check_legends(browser, run, seed):

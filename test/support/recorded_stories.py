@@ -28,10 +28,8 @@ from support.robot_bags import write_with_records
 
 DURATION, LEAD = 20.0, 0.4
 RADIUS, SEPARATION = 0.035, 0.147
-ERROR = 0.01 * math.sqrt(2.0)
-"""Amplitude of the error of the wheels, rad/s."""
-BRAKING = 0.1
-"""Time from the begin of a stop to standstill, s."""
+ERROR = 0.01 * math.sqrt(2.0)  # amplitude of the error of the wheels, rad/s
+BRAKING = 0.1  # time from the begin of a stop to standstill, s
 SLIP_STOP = (
     'gyro and steps disagree: a wheel slips, is blocked, or has lost steps; stop commanding '
     'motion for 0.5 s to resume'
@@ -53,47 +51,32 @@ TWIN = {
 class Story:
     """A run, and what its report says first."""
 
-    sentence: str
-    """A regular expression."""
-    kind: str
-    """Kind of the verdict: good, open or bad."""
+    sentence: str  # a regular expression
+    kind: str  # kind of the verdict: good, open or bad
     records: dict = field(default_factory=lambda: TWIN)
-    stands: tuple = ()
-    """Spans in which the robot stands, s."""
-    blocked: tuple = ()
-    """Spans in which its right wheel stands, s."""
-    lost: float = 0.0
-    """Error that it has besides, rad/s."""
+    stands: tuple = ()  # spans in which the robot stands, s
+    blocked: tuple = ()  # spans in which its right wheel stands, s
+    lost: float = 0.0  # error that it has besides, rad/s
     reports: tuple = ()
     """Time, node, level and text of diagnostics; they are repeated each second until the next."""
-    late: Callable = lambda t: 0.0
-    """By how much messages of an instant are received late, s."""
-    kept: Callable = lambda t, topic: True
-    """Which messages are recorded."""
-    moved: Callable = lambda t: 0.0
-    """By how much the position is shifted, m."""
+    late: Callable = lambda t: 0.0  # by how much messages of an instant are received late, s
+    kept: Callable = lambda t, topic: True  # which messages are recorded
+    moved: Callable = lambda t: 0.0  # by how much the position is shifted, m
     set_at: float = math.inf
     """Time at which odometry and path begin anew where the robot is, ground truth does not, s."""
-    path: bool = False
-    """Whether the reference is a path with poses."""
-    detour: tuple = ()
-    """Span in which the robot makes a detour of 0.3 m, s."""
-    rests: float = math.inf
-    """Time from which the reference rests, s."""
-    names: dict = field(default_factory=dict)
-    """Other names of topics."""
+    path: bool = False  # whether the reference is a path with poses
+    detour: tuple = ()  # span in which the robot makes a detour of 0.3 m, s
+    rests: float = math.inf  # time from which the reference rests, s
+    names: dict = field(default_factory=dict)  # other names of topics
     second_robot: bool = False
     second_controller: bool = False
-    twist: bool = True
-    """Whether the odometry has one."""
+    twist: bool = True  # whether the odometry has one
     frozen: float = math.inf
     """Time from which the odometry repeats its last message with a new stamp, s."""
-    switches: tuple = ()
-    """Times at which the reference switches, s."""
+    switches: tuple = ()  # times at which the reference switches, s
     rate: float = 50.0
     """Of the messages of a topic, Hz; that of the robot is 100, which a stall is seen by."""
-    apart: int = 0
-    """Time from a stamp of the reference to one of the odometry, ns."""
+    apart: int = 0  # time from a stamp of the reference to one of the odometry, ns
 
     def rows(self):
         """Return rows of receipt (s), topic and message."""
