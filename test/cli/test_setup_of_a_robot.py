@@ -27,10 +27,10 @@ import sys
 import numpy as np
 import pytest
 from support.avr_bench import on_avr
-from support.calibration_bench import CalibrationBench, Person
+from support.calibration_bench import Person
 from support.emulator_bench import CablePort, RobotBench
 from support.missing_tools import AVR, needing
-from support.tool_bench import START_NS
+from support.tool_bench import START_NS, ToolBench
 import yaml
 
 from t3mpc_ros.cli import robot as cli
@@ -112,7 +112,7 @@ class Walk:
     """Executes the commands at the ports of one robot, at first with erased EEPROM."""
 
     def __init__(self, emulator, monkeypatch, capsys):
-        self.bench = CalibrationBench(emulator=emulator)
+        self.bench = ToolBench(emulator=emulator)
         self.person = person = Person(self.bench)
         self._capsys = capsys
         self.questions = []

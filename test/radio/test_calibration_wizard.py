@@ -23,7 +23,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.calibration_bench import CalibrationBench, Person
+from support.calibration_bench import Person
+from support.tool_bench import START_NS, ToolBench
 import yaml
 
 from t3mpc_ros.cli import robot as robot_cli
@@ -63,7 +64,7 @@ ERRORS = {
 
 @pytest.fixture
 def person(monkeypatch):
-    bench = CalibrationBench(**ERRORS)
+    bench = ToolBench(**ERRORS)
     monkeypatch.setattr(
         procedure,
         'run_at_port',
@@ -175,7 +176,7 @@ def test_a_fault_stops_the_drive_for_good(person, fault):
     assert 'Refused: ' in person.transcript
     stopped = person.plant.stopped_at
     # The time to live, and the ramp from 4 rad/s at 8 rad/s².
-    assert stopped - (faults[0] - bench.start_ns) / 1e9 < 0.25 + 0.5 + 0.2
+    assert stopped - (faults[0] - START_NS) / 1e9 < 0.25 + 0.5 + 0.2
     assert bench.now_ns - faults[0] > 3e9
 
 

@@ -771,14 +771,6 @@ def test_an_emergency_stop_survives_a_jammed_link(bench):
     assert bench.robot.estop
 
 
-def test_a_restart_during_shutdown_starts_no_session(bench):
-    bench.link.shut_down()
-    bench.robot.boot(bench.now_ns)
-    bench.robot.log.clear()
-    bench.run(1.5, lambda: bench.link.state is LinkState.DONE)
-    assert not any(isinstance(frame, frames.Hello) for _, frame in bench.robot.log)
-
-
 def test_another_host_on_the_robot_is_detected():
     bench = LinkBench()
     bench.connect()

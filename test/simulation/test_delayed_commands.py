@@ -132,17 +132,6 @@ def test_loss_and_jitter_use_independent_random_numbers():
     assert arrivals(make_transport(4), 300, 0.0, 0.0, 0.4).keys() == some.keys()
 
 
-def test_every_command_draws_two_random_numbers():
-    generators = [np.random.default_rng(5) for _ in range(4)]
-    parameters = [(0.0, 0.0, 0.0), (0.1, 0.2, 0.3), (0.0, 0.0, 1.0)]
-    for generator, values in zip(generators, parameters, strict=False):
-        transport = TransportDelay(generator)
-        for number in range(100):
-            transport.send(command(number), 0, *values)
-    generators[3].random(200)
-    assert len({generator.random() for generator in generators}) == 1
-
-
 def test_backward_time_jump_clears_the_queue():
     for ask in (
         lambda transport: transport.arrived(50),

@@ -19,7 +19,6 @@ import re
 
 import numpy as np
 
-from support.tool_bench import START_NS, ToolBench
 from t3mpc_ros.robot.calibration import MARKS
 
 HAND_RATE = 3.0  # rad/s
@@ -124,17 +123,3 @@ class Person:
         rate = HAND_RATE * 4.0 * phase * (1.0 - phase)
         self._turned += rate * dt
         return rate
-
-
-class CalibrationBench(ToolBench):
-    """A bench whose robot can be left alone for a while."""
-
-    start_ns = START_NS
-
-    def wait(self, seconds):
-        end = self.now_ns + round(1e9 * seconds)
-        while self.now_ns < end:
-            self.now_ns = min(end, self.now_ns + 10_000_000)
-            self.emulator.run_to(self.now_ns)
-            if self.each is not None:
-                self.each(self)

@@ -561,6 +561,13 @@ def all_of(thing: object, *without: str) -> tuple[str, ...]:
     )
 
 
+UNUSED = (
+    '._sampled',
+    *below('._tracker.transition', RAMPS),
+    *below('._tracker.law', LAST[:5]),
+    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
+)
+"""What a reset controller writes before it reads it."""
 IMU_TUNING = '._colour', '._dt', '._walk_step'
 BODY = (
     *('._arrays.state', '._arrays.modes', '._arrays.totals', '._state', '._modes', '._now'),
@@ -669,12 +676,7 @@ FRESH = {
             'reset': Operation(
                 lambda c: c.reset(),
                 kept=('._watchdog.enabled',),
-                scratch=(
-                    '._sampled',
-                    *below('._tracker.transition', RAMPS),
-                    *below('._tracker.law', LAST[:5]),
-                    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
-                ),
+                scratch=UNUSED,
             ),
             'a time-out of the odometry': Operation(
                 lambda c: c.check_odometry(None, 0),
@@ -696,12 +698,7 @@ FRESH = {
             'set_weights': Operation(
                 lambda c: (c.reset(), c.set_weights(OTHER_WEIGHTS)),
                 kept=('._watchdog.enabled',),
-                scratch=(
-                    '._sampled',
-                    *below('._tracker.transition', RAMPS),
-                    *below('._tracker.law', LAST[:5]),
-                    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
-                ),
+                scratch=UNUSED,
             ),
         },
     ),

@@ -80,6 +80,15 @@ class ToolBench:
                 self.is_open = False
         return wake
 
+    def wait(self, seconds):
+        """Leave the robot alone for a while."""
+        end = self.now_ns + round(1e9 * seconds)
+        while self.now_ns < end:
+            self.now_ns = min(end, self.now_ns + 10_000_000)
+            self.emulator.run_to(self.now_ns)
+            if self.each is not None:
+                self.each(self)
+
     def at_dongle(self, script, board=DONGLE):
         """Return the result of a script, for this board or another, at the port of the dongle."""
         return self._result(self.run(Procedure(script, board.decode)))
