@@ -120,7 +120,7 @@ class Emulator:
         self.board.on_settings = self._follow_settings
         self._follow_settings(self.board.radio_settings)
         self._boot_ns = now_ns
-        self._robot_off = False  # whether the robot board is without power or in its boot loader
+        self.powered = True  # whether the robot board runs: with power, behind its boot loader
         self.dongle = Dongle(
             self._events,
             self._channel,
@@ -149,11 +149,6 @@ class Emulator:
     def next_ns(self) -> int | None:
         """Time of the next event; None: no event is scheduled."""
         return self._events.next_ns
-
-    @property
-    def powered(self) -> bool:
-        """Whether the robot board runs."""
-        return not self._robot_off
 
     # -- serial line ------------------------------------------------------------------------------
 
@@ -188,7 +183,7 @@ class Emulator:
 
     def restart_robot(self) -> None:
         """Reboot the robot board, as most boards do when their port is opened."""
-        if not self._robot_off:
+        if self.powered:
             self._to_console.clear()
             self._from_console.clear()
             self._cut_power()
@@ -285,7 +280,7 @@ class Emulator:
         """Advance the robot to now; return whether its board runs."""
         elapsed = self._events.now_ns - self._boot_ns
         time_us = int(elapsed * self._clock_rate) // MICROSECOND
-        if self._robot_off:
+        if not self.powered:
             self.plant.run(time_us)
             self._boot_ns = self._events.now_ns
             return False
@@ -305,19 +300,19 @@ class Emulator:
         self._lose_power()
 
     def _lose_power(self) -> None:
-        self._robot_off = True
+        self.powered = False
         self._boot_ns = self._events.now_ns
         self._channel.clear()
         self.plant.set_motors(False, False)
 
     def _boot_robot(self, cause: int) -> None:
-        if not self._robot_off:
+        if self.powered:
             return
         self._advance_robot()
         if self.plant.undervoltage:
             self._boot_later(cause)
             return
-        self._robot_off = False
+        self.powered = True
         self._boot_ns = self._events.now_ns
         self.board.boot(cause)
 

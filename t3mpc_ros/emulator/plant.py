@@ -34,7 +34,7 @@ from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu
 from t3mpc_ros.simulation.sensors.range_sensor import NOT_CONVERTED, SimulatedRangeSensors
-from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
+from t3mpc_ros.simulation.world import cast_rays, compile_kernels, load_world
 
 _SAMPLE_STEPS = 5  # integration steps (1 ms) between two samples of the sensors
 _ADC_FULL_SCALE = 20_000
@@ -214,14 +214,7 @@ class Plant:
         plant.boot(self._motor.microsteps)
         plant.set_motors(True, True)
         plant.run(50_000, 1.0, 1.0)
-        room = load_world('room')
-        clearance(0.0, 0.0, room.segments, room.circles)
-        grip_at(0.0, 0.0, room.patches)
-        sensors = np.arange(len(RANGE_SENSORS))
-        cast_rays(
-            0.0, 0.0, 0.0, self._mounts, sensors, room.segments, room.circles, self._distances
-        )
-        self._distances[:] = math.inf
+        compile_kernels(self._mounts)
 
     def _measure(self) -> None:
         parameters, drivetrain = self._parameters, self._drivetrain
@@ -239,8 +232,7 @@ class Plant:
         world = self._drivetrain.world.seen
         if due and (world.segments.size or world.circles.size):
             pose, which = self._drivetrain.pose, np.array(due)
-            walls = world.segments, world.circles
-            cast_rays(*pose, self._mounts, which, *walls, self._distances)
+            cast_rays(*pose, self._mounts, which, *world, self._distances)
         for sensor in due:
             self._ranges.measure(sensor, float(self._distances[sensor]))
 

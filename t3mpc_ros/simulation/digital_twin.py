@@ -55,7 +55,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
 )
-from t3mpc_ros.simulation.world import MovingDisc, cast_rays, clearance, grip_at, load_world
+from t3mpc_ros.simulation.world import MovingDisc, cast_rays, compile_kernels, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
 CAPACITY = 1000  # commands in transit at most: 2 s at 500 Hz
@@ -287,10 +287,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     def warm_up(self) -> None:
         """Compile every kernel of a step, on a separate robot."""
         DigitalTwin(self._parameters).step(interface.ZERO_WHEEL_SPEEDS)
-        world, count = load_world('room'), len(self._mounts)
-        clearance(0.0, 0.0, *world.obstacles)
-        grip_at(0.0, 0.0, world.patches)
-        cast_rays(0.0, 0.0, 0.0, self._mounts, np.arange(count), *world.seen, np.empty(count))
+        compile_kernels(self._mounts)
 
     # -- simulation step --------------------------------------------------------------------------
 
@@ -339,7 +336,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         )
         self._slip_monitor.reset()
         self._channel.clear()
-        self._limiter.stop(BROWN_OUT_REASON, self._now_ns())
+        self._limiter.stop(BROWN_OUT_REASON, self._reached_ns)
         self._imu.restart()
         drivetrain.filtered[:] = 0.0
         self._odometry.forget_bias()
@@ -404,7 +401,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             self._measured = self._noise.measure(speeds, self._elapsed)
         slipping_for = self._odometry.slipping_for
         if self._slip_monitor.update(slipping_for, self._parameters.slip_stop, self._elapsed):
-            self._limiter.stop(SLIP_STOP_REASON, self._now_ns())
+            self._limiter.stop(SLIP_STOP_REASON, self._reached_ns)
 
     def _update_ranges(self, dt: float) -> None:
         """Measure with the range sensors that are due."""

@@ -46,7 +46,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         self._top, self._bottom = frequency.as_integer_ratio()
         self._origin_ns: int | None = None
         self._steps_since_origin = 0  # integration steps since the origin of the time grid
-        self._reached_ns = 0
+        self._reached_ns = 0  # time of the last finished substep
         self._reports: deque[RobotState] = deque(maxlen=1024)
         """The newest state, and older ones that were not requested yet."""
 
@@ -58,7 +58,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     @abstractmethod
     def _integrate(self, count: int) -> None:
-        """Run ``count`` integration steps from :meth:`_now_ns` on."""
+        """Run ``count`` integration steps from :attr:`_reached_ns` on."""
 
     @abstractmethod
     def _measure(self) -> None:
@@ -135,7 +135,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
         For closed loops without a clock, on the time grid of the robot.
         """
-        now_ns = self._now_ns()
+        now_ns = self._reached_ns
         self.apply(RobotCommand(wheels, now_ns), now_ns)
         return self._advance_period()
 
@@ -146,10 +146,6 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     def _refresh_state(self) -> None:
         self._reports[-1] = self._make_state(self._reports[-1].stamp_ns)
-
-    def _now_ns(self) -> int:
-        """Return the time of the last finished substep."""
-        return self._reached_ns
 
     def _stamp_after(self, steps: int) -> int:
         """Return the instant (ns) that lies ``steps`` integration steps after the origin."""

@@ -57,7 +57,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         # The limiter decides only whether the torque may act.
         finite = math.isfinite(right) and math.isfinite(left)
         wheels = interface.ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
-        now_ns = self._run_to(self._now_ns())
+        now_ns = self._run_to(self._reached_ns)
         self._limiter.accept(interface.RobotCommand(wheels, now_ns), now_ns)
         self._torque = (float(right), float(left))
         return self._advance_period()
@@ -86,7 +86,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
 
     def _integrate(self, count: int) -> None:
         """Run ``count`` steps under one command."""
-        self._limited_command = self._limiter.advance(self._now_ns(), count * self._plant.step)
+        self._limited_command = self._limiter.advance(self._reached_ns, count * self._plant.step)
         braking = bool(self._limited_command.reason)
         torque_mode = self._parameters.drive.kind == 'torque' and not braking
         command = self._torque if torque_mode else self._limited_command.wheels

@@ -553,3 +553,11 @@ def grip_at(x: float, y: float, patches: Array) -> float:
         if to_x * to_x + to_y * to_y <= patches[row, 2] * patches[row, 2]:
             grip = min(grip, patches[row, 3])
     return grip
+
+
+def compile_kernels(mounts: Array) -> None:
+    """Compile the kernels that an empty plain does not need; ``mounts``: see cast_rays."""
+    room, count = load_world('room'), len(mounts)
+    clearance(0.0, 0.0, *room.obstacles)
+    grip_at(0.0, 0.0, room.patches)
+    cast_rays(0.0, 0.0, 0.0, mounts, np.arange(count), *room.seen, np.empty(count))
