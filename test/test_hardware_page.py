@@ -13,7 +13,6 @@
 # limitations under the License.
 """The schematics of docs/hardware.md agree with the firmware, with their source and the page."""
 
-from importlib.util import module_from_spec, spec_from_file_location
 import math
 from pathlib import Path
 import re
@@ -28,6 +27,10 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / 'docs'))
+import drawings  # noqa: E402
+import schematic  # noqa: E402
+
 PAGE = ROOT / 'docs' / 'hardware.md'
 SHEETS = ('power', 'robot', 'radio')
 
@@ -71,14 +74,6 @@ _STEPS = {
 }
 
 
-@pytest.fixture(scope='module')
-def schematic():
-    spec = spec_from_file_location('schematic', ROOT / 'docs' / 'schematic.py')
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def _firmware(name):
     [path] = (ROOT / 'firmware').rglob(name)
     return path.read_text()
@@ -99,14 +94,14 @@ def _ports(part, mapping):
     return {mapping[pin]: net for pin, net in nets.items() if pin in mapping and net}
 
 
-def test_the_pins_of_the_dongle_are_those_of_its_firmware(schematic):
+def test_the_pins_of_the_dongle_are_those_of_its_firmware():
     text = _firmware('board.h').split('#elif')[0]
     pins = _defined_pins(text, _SHARED)
     assert set(pins) == set(_SHARED)
     assert _ports(schematic.NANO, _NANO) == {pins[name]: net for name, net in _SHARED.items()}
 
 
-def test_the_pins_of_the_robot_are_those_of_its_firmware(schematic):
+def test_the_pins_of_the_robot_are_those_of_its_firmware():
     text = _firmware('board.h').split('#elif')[1]
     pins = _defined_pins(text, _ROBOT)
     assert set(pins) == set(_ROBOT)
@@ -118,14 +113,14 @@ def test_the_pins_of_the_robot_are_those_of_its_firmware(schematic):
     assert _ports(schematic.MEGA, _MEGA) == expected
 
 
-def test_the_analogue_inputs_are_those_of_the_firmware(schematic):
+def test_the_analogue_inputs_are_those_of_the_firmware():
     battery = re.search(r'#define T3_ADC_BATTERY (\d+)u', _firmware('t3_port.h'))[1]
     inputs = {p: net for p, net in schematic.MEGA.nets().items() if re.fullmatch(r'A\d', p)}
     ranges = {f'A{number}': f'RANGE_{number}' for number in range(8)}
     assert inputs == {**ranges, f'A{battery}': 'BATTERY'}
 
 
-def test_every_net_connects_at_least_two_pins(schematic):
+def test_every_net_connects_at_least_two_pins():
     """Nets that the sheet of the supplies has as wires count as connected."""
     supplies = {'+5V', 'GND', '+3V0', 'VMOT', 'BATTERY', 'ESTOP'}
     motors = re.compile(r'MOTOR_[LR]_[12][AB]|see table')
@@ -143,7 +138,7 @@ def _table(heading):
 
 
 @pytest.mark.parametrize('heading, board', [('Robot board', 'MEGA'), ('Dongle', 'NANO')])
-def test_the_wiring_tables_have_the_pins_of_the_schematic(schematic, heading, board):
+def test_the_wiring_tables_have_the_pins_of_the_schematic(heading, board):
     pins = [pin.split()[0] for pin in getattr(schematic, board).nets()]
     signals = [pin for pin in pins if re.fullmatch(r'A?\d+', pin)]
     assert sorted(_table(heading)) == sorted(signals)
@@ -155,7 +150,7 @@ def _texts(path):
 
 @pytest.mark.parametrize('sheet', SHEETS)
 @pytest.mark.slow
-def test_the_pictures_are_drawn_from_their_source(schematic, sheet, tmp_path):
+def test_the_pictures_are_drawn_from_their_source(sheet, tmp_path):
     """Compared by their texts: another release of the library may place a line elsewhere."""
     pytest.importorskip('schemdraw')
     getattr(schematic, f'draw_{sheet}')(tmp_path)
@@ -163,7 +158,7 @@ def test_the_pictures_are_drawn_from_their_source(schematic, sheet, tmp_path):
     assert _texts(tmp_path / name) == _texts(ROOT / 'docs' / 'images' / name)
 
 
-def test_every_component_of_the_schematics_is_in_the_parts(schematic):
+def test_every_component_of_the_schematics_is_in_the_parts():
     page = PAGE.read_text()
     parts = page[page.index('## Parts') : page.index('## Supply')]
     drawn = {
@@ -189,17 +184,7 @@ def test_reference_voltages_follow_from_their_formulas():
 # -- drawings -------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope='module')
-def drawings():
-    spec = spec_from_file_location('drawings', ROOT / 'docs' / 'drawings.py')
-    module = module_from_spec(spec)
-    sys.modules['drawings'] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules['drawings']
-
-
-def test_the_drawings_are_drawn_from_their_source(drawings, tmp_path):
+def test_the_drawings_are_drawn_from_their_source(tmp_path):
     """And so from the parameters of geometry and sensors."""
     drawings.draw_all(tmp_path)
     for path in sorted(tmp_path.glob('*.svg')):
@@ -219,7 +204,7 @@ def test_the_dimensions_are_those_of_the_parameters():
     assert {name.replace('_', ' ') for name in RANGE_SENSORS} <= texts
 
 
-def test_the_side_sensors_clear_the_tyres(drawings):
+def test_the_side_sensors_clear_the_tyres():
     """Lying, with 37 mm along the body, they would touch them."""
     depth, length = drawings.SENSOR
     inner = drawings.HALF_WIDTH - depth
@@ -228,7 +213,7 @@ def test_the_side_sensors_clear_the_tyres(drawings):
     assert drawings.OFFSET - length / 2 < drawings.RADIUS
 
 
-def test_the_strip_board_connects_what_the_schematic_connects(drawings, schematic):
+def test_the_strip_board_connects_what_the_schematic_connects():
     """Groups of pins by strips, cuts and links are the nets of radio, buffer, regulator and R6."""
     nets = {}
     for name, part in (('U2', schematic.BUFFER), ('radio', schematic.RADIO)):
@@ -255,7 +240,7 @@ def test_the_strip_board_connects_what_the_schematic_connects(drawings, schemati
     assert sorted(map(sorted, found)) == sorted(map(sorted, nets.values()))
 
 
-def test_no_hole_of_the_strip_board_is_used_twice(drawings):
+def test_no_hole_of_the_strip_board_is_used_twice():
     holes = list(drawings.used_holes())
     assert len(holes) == len(set(holes))
     for row, column in holes:

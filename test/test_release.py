@@ -15,7 +15,6 @@
 
 import csv
 from importlib.metadata import version
-import importlib.util
 import json
 from pathlib import Path
 import re
@@ -27,6 +26,7 @@ from packaging.requirements import Requirement
 import pytest
 from support.headers import COMMENT, header, sources
 
+from bench import release_results
 from t3mpc_ros.missing_library import REQUIREMENTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -138,9 +138,6 @@ def test_a_release_is_tagged_only_if_its_files_agree(change, words, tmp_path):
 
 def test_the_runs_of_a_release_are_one_file(tmp_path, monkeypatch):
     """Parts that are there are not made again; every row says of which study it is."""
-    spec = importlib.util.spec_from_file_location('runs', ROOT / 'bench' / 'release_results.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     file, made = tmp_path / 'runs.csv', []
 
     def command(words):
@@ -151,13 +148,13 @@ def test_the_runs_of_a_release_are_one_file(tmp_path, monkeypatch):
         part.write_text(f'seed,{part.stem}\n1,{len(made)}\n')
         return 0
 
-    parts = module.parts(tmp_path / 'runs.parts', quick=False)
-    monkeypatch.setattr(module, 't3mpc', command)
+    parts = release_results.parts(tmp_path / 'runs.parts', quick=False)
+    monkeypatch.setattr(release_results, 't3mpc', command)
     monkeypatch.setattr('sys.argv', ['release_results.py', str(file)])
-    assert module.main() == 130
+    assert release_results.main() == 130
     assert len(made) == 2
     del made[:]
-    assert module.main() == 0
+    assert release_results.main() == 0
     rows = list(csv.DictReader(file.read_text().splitlines()))
     assert [row['study'] for row in rows] == ['paper', 'compare', 'compare', 'compare']
     assert [path.stem for path in made] == ['servo', 'twin']

@@ -180,8 +180,6 @@ def test_imports_follow_the_direction_of_the_packages():
 
 
 def _check_imports(path):
-    import sys
-
     package = _package(path)
     for name in _imports(path):
         top, *rest = name.split('.')
@@ -284,8 +282,6 @@ def _private_names(nodes: Sequence[ast.AST]) -> set[str]:
 
 
 def _is_private(name: str) -> bool:
-    import sys
-
     first, *parts = name.split('.')
     if first in sys.stdlib_module_names | {'t3mpc_ros'}:
         return False

@@ -20,7 +20,6 @@ import random
 import pytest
 
 from t3mpc_ros.radio.protocol import framing
-from t3mpc_ros.radio.protocol import framing as module
 
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
 
@@ -138,7 +137,7 @@ def test_random_bytes_yield_no_frame_or_growth():
     decoder, found = framing.FrameDecoder(), []
     for _ in range(200):
         found += decoder.feed(source.randbytes(1000))
-        assert len(decoder._buffer) <= module._ENCODED_LIMIT
+        assert len(decoder._buffer) <= framing._ENCODED_LIMIT
     counts = decoder.counts
     assert counts.frames == len(found) <= 1
     assert counts.crc_errors + counts.frame_errors > 700  # a zero every 256 bytes
