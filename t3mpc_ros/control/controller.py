@@ -1088,8 +1088,8 @@ class Controller:
                 slope = STANDSTILL if after is None else after.rate
                 self._tracker.transition.announce(
                     jump.stamp_ns,
-                    _as_array(wheels_from_twist(jump.change, geometry)),
-                    _as_array(wheels_from_twist(slope, geometry)),
+                    np.array(wheels_from_twist(jump.change, geometry)),
+                    np.array(wheels_from_twist(slope, geometry)),
                 )
         self._jumps = [
             jump
@@ -1325,7 +1325,3 @@ def _command_limit(parameters: ControllerParameters) -> CommandLimit:
     """Return the acceleration limits of the command for the ramps of jumps."""
     mean, half, wheel = wheel_limits(parameters.limits, parameters.geometry)[1].tolist()
     return CommandLimit(mean, half, wheel, parameters.jump_transition.acceleration)
-
-
-def _as_array(wheels: WheelSpeeds) -> Array:
-    return np.array((wheels.right, wheels.left))

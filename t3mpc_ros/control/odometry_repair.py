@@ -238,8 +238,10 @@ class VelocityFit:
         self._precision = np.array(prior) ** -2.0
         self._normal = np.zeros((len(prior), len(prior)))
         self._product = np.zeros(len(prior))
-        self._square = self._apart = 0.0
-        self._least, self._noise = least_noise**2, least_noise**2
+        self._square = 0.0
+        self.difference = 0.0  # sum of the squared differences of twist and rate
+        self._least = least_noise**2
+        self.unexplained = least_noise**2  # mean square of what the fit does not explain
         self._rough = [0.0, 0.0]
         self.rows = 0.0
         self.values = [1.0] + [0.0] * (len(prior) - 1)
@@ -253,7 +255,7 @@ class VelocityFit:
         self._normal = kept * self._normal + each[:, np.newaxis] * each
         self._product = kept * self._product + twist * each
         self._square = kept * self._square + twist**2
-        self._apart = kept * self._apart + (twist - row[0]) ** 2
+        self.difference = kept * self.difference + (twist - row[0]) ** 2
         self._rough = [kept * old + new for old, new in zip(self._rough, rough, strict=True)]
         if self.rows < FIT_ROWS:
             if self.is_reversed:
@@ -261,11 +263,11 @@ class VelocityFit:
             return
         # It is 1 times the rate where nothing is known.
         rest = self._product - self._normal[:, 0]
-        inverse = np.linalg.inv(self._normal + np.diag(self._noise * self._precision))
+        inverse = np.linalg.inv(self._normal + np.diag(self.unexplained * self._precision))
         values = inverse @ rest
-        square = self._apart - 2.0 * values @ rest + values @ self._normal @ values
-        self._noise = max(float(square) / (self.rows - values.size), self._least)
-        self.deviations = np.sqrt(FIT_VARIANCE * self._noise * inverse.diagonal()).tolist()
+        square = self.difference - 2.0 * values @ rest + values @ self._normal @ values
+        self.unexplained = max(float(square) / (self.rows - values.size), self._least)
+        self.deviations = np.sqrt(FIT_VARIANCE * self.unexplained * inverse.diagonal()).tolist()
         values[0] += 1.0
         self.values = values.tolist()
         # A factor alone is known much better, where it explains the twist as well.
@@ -273,7 +275,7 @@ class VelocityFit:
         if not motion:
             return
         rest_alone = (self._square - product**2 / motion) / (self.rows - 1.0)
-        if rest_alone < ALONE * self._noise and not self._is_offset:
+        if rest_alone < ALONE * self.unexplained and not self._is_offset:
             self.values[0] = product / motion
             self.deviations[0] = math.sqrt(FIT_VARIANCE * max(rest_alone, self._least) / motion)
 
@@ -281,7 +283,7 @@ class VelocityFit:
         """Return the log likelihood ratio of a twist late by a time (s) to one that fits."""
         square = float(self._normal[1, 1])
         product = float(self._product[1] - self._normal[0, 1])
-        return time * (product - 0.5 * time * square) / (FIT_VARIANCE * self._noise)
+        return time * (product - 0.5 * time * square) / (FIT_VARIANCE * self.unexplained)
 
     @property
     def left_by_factor(self) -> float:
@@ -290,16 +292,13 @@ class VelocityFit:
         return float(left)
 
     @property
-    def difference(self) -> float:
-        """Sum of the squared differences of twist and rate."""
-        return self._apart
-
-    @property
     def _is_offset(self) -> bool:
         """Whether an offset alone, as that of a gyro, explains the twist as well."""
         offset = float(self._product[2] - self._normal[0, 2]) / self.rows
-        rest = (self._apart - self.rows * offset**2) / (self.rows - 1.0)
-        return abs(offset) < OFFSETS * self._precision[2] ** -0.5 and rest < ALONE * self._noise
+        rest = (self.difference - self.rows * offset**2) / (self.rows - 1.0)
+        return (
+            abs(offset) < OFFSETS * self._precision[2] ** -0.5 and rest < ALONE * self.unexplained
+        )
 
     def is_certain(self, index: int, times: float) -> bool:
         """Whether a value is not the one of a twist that fits."""
@@ -308,18 +307,13 @@ class VelocityFit:
     @property
     def is_reversed(self) -> bool:
         """Whether the twist is the negative of the rate of the pose, from few comparisons."""
-        left = self._apart + 4.0 * float(self._product[0])
-        return round(self.rows) >= REVERSED_ROWS and left < REVERSED * self._apart
+        left = self.difference + 4.0 * float(self._product[0])
+        return round(self.rows) >= REVERSED_ROWS and left < REVERSED * self.difference
 
     @property
     def motion(self) -> float:
         """Mean square of the rate of the pose."""
         return float(self._normal[0, 0]) / max(self.rows, 1.0)
-
-    @property
-    def unexplained(self) -> float:
-        """Mean square of what the fit does not explain."""
-        return self._noise
 
     @property
     def roughness(self) -> float:
@@ -329,7 +323,7 @@ class VelocityFit:
     def prefers_pose(self, least: float) -> bool:
         """Whether the noise of the rate of the pose is less than what is wrong with the twist."""
         twist, pose = self._rough
-        return pose < twist + self._apart + self.rows * least**2
+        return pose < twist + self.difference + self.rows * least**2
 
 
 class HeldTwist:

@@ -392,7 +392,8 @@ class Localizer:
         if self._tracker.active:
             self._tracker.predict(last or pose, pose, since)
         if self._updated is None:
-            return self._publish(pose)
+            self._publish(pose)
+            return True
         parameters = self.parameters
         self._turn(pose, since)
         turned = pose._replace(yaw=pose.yaw + self._turned)
@@ -400,7 +401,8 @@ class Localizer:
             return False
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
         self.filter.predict(self._updated, turned, elapsed)
-        return self._correct(pose, elapsed)
+        self._correct(pose, elapsed)
+        return True
 
     def _follow_jump(self, last: Pose, pose: Pose) -> bool:
         """Take a jump of the odometry for one of its frame; return whether there is a pose."""
@@ -415,17 +417,14 @@ class Localizer:
         )
         return True
 
-    def _correct(self, pose: Pose, elapsed: float) -> bool:
-        """Correct the particles and the tracked pose by the readings since the last update.
-
-        Return whether there is a pose.
-        """
+    def _correct(self, pose: Pose, elapsed: float) -> None:
+        """Correct the particles and the tracked pose by the readings since the last update."""
         taken, doubtful = self._take_beams(pose), self.doubtful
         of_the_map = {sensor: self._of_the_map(each, pose) for sensor, each in taken.items()}
         known = joined([each for name, each in of_the_map.items() if name not in doubtful])
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
         self.filter.correct(known, 1.0 - self.agreement if self._searching else 0.0)
-        found = self._publish(pose)
+        self._publish(pose)
         self._compare(known)
         self._track(pose, known, elapsed)
         for sensor, each in of_the_map.items():
@@ -433,7 +432,6 @@ class Localizer:
                 self._fits[sensor] = followed(self._fits[sensor], self._explain(each)[:, 0])
         if self.parameters.changes.enabled:
             self._detect(joined([each for name, each in taken.items() if name not in doubtful]))
-        return found
 
     def _track(self, odometry: Pose, known: Beams, elapsed: float) -> None:
         """Correct the pose that is tracked; where the place is known it begins anew."""
@@ -504,7 +502,7 @@ class Localizer:
         self._pending.clear()
         return found
 
-    def _publish(self, odometry: Pose) -> bool:
+    def _publish(self, odometry: Pose) -> None:
         estimate = self.filter.estimate()
         if self._updated is not None and self._estimate is not None:
             expected = pose_in(self._estimate.odometry_frame, odometry)
@@ -520,7 +518,6 @@ class Localizer:
             covariance = self.filter.spread(estimate.pose)
         frame = frame_between(estimate.pose, odometry)
         self._estimate = LocalizedPose(self._stamp_ns, estimate.pose, covariance, frame)
-        return True
 
     def _compare(self, beams: Beams) -> None:
         """Update the share of readings that fit to the map at the estimate."""

@@ -361,8 +361,7 @@ def propagate_covariance(
     """Propagate errors of yaw, bias and scale to the pose: ``matrix`` <- F ``matrix`` F'.
 
     ``across`` is d(x, y) by the yaw, ``fused`` d(pose) by the turn measured by the gyro; ``dt``
-    and
-    ``turn`` are the effects of bias and scale on that turn.
+    and ``turn`` are the effects of bias and scale on that turn.
     """
     for column in range(5):
         shift = dt * matrix[3, column] + turn * matrix[4, column]
@@ -388,9 +387,7 @@ def estimate_bias(
     covariance: Array,
     drift: Array,
     memory: GyroMemory,
-    variance: float,
-    spread: float,
-    limit: float,
+    constants: GyroConstants,
 ) -> None:
     """Update the bias by the mean of the window if the robot was not moved.
 
@@ -398,14 +395,15 @@ def estimate_bias(
 
     A mean beyond 5 sigma is used only when a second one confirms it: a robot turned by hand does
     not turn so evenly. It is then a jump at an unknown time since the last standstill, which
-    ``drift``, scaled to its size, represents in the covariance. ``variance`` is that of the mean,
-    from the noise alone; ``spread`` the largest standard deviation of the samples.
+    ``drift``, scaled to its size, represents in the covariance.
     """
-    count = memory.count
+    count, spread = memory.count, constants.standstill_spread
+    single = max(1.0 / memory.time, 0.5 / (constants.gyro_delay * count))
+    variance = constants.gyro_noise * constants.gyro_noise * single  # of the mean, by the noise
     innovation = memory.total / count
     scatter = max(memory.squares - innovation * memory.total, 0.0) / (count - 1.0)
     clear_window(memory)
-    if scatter > spread * spread or abs(memory.bias + innovation) > limit:
+    if scatter > spread * spread or abs(memory.bias + innovation) > constants.gyro_bias_limit:
         memory.suspect_variance = 0.0
         return
     variance = max(variance, scatter / count)
@@ -464,8 +462,7 @@ def update_filter(
     With the variances V of the two travels and N of the turn measured by the gyro, and
     h = 1 / 2b, the excess of the gyro over the steps changes the travels by ``K excess dt``,
     ``K = V (h, -h) / (h² sum V + N)``. ``drift`` is the covariance that a random walk of the bias
-    by
-    1 rad/s/√s would have added since the last bias measurement; ``gyro`` is NaN without one.
+    by 1 rad/s/√s would have added since the last bias measurement; ``gyro`` is NaN without one.
     """
     memory, constants = memories[0], settings[0]
     radius, half, per_metre = (
@@ -580,14 +577,4 @@ def average_standstill(
     memory.total += deviation
     memory.squares += deviation * deviation
     if memory.time >= constants.standstill_time and memory.count >= MIN_SAMPLES:
-        single = max(1.0 / memory.time, 0.5 / (constants.gyro_delay * memory.count))
-        variance = constants.gyro_noise * constants.gyro_noise * single
-        estimate_bias(
-            pose,
-            covariance,
-            drift,
-            memory,
-            variance,
-            constants.standstill_spread,
-            constants.gyro_bias_limit,
-        )
+        estimate_bias(pose, covariance, drift, memory, constants)
