@@ -54,14 +54,14 @@ KEEP_OUT = 0.165
 
 
 class Room:
-    """A room of which the robot sees the floor around it, or in a sector ahead."""
+    """A room, known or of which the robot sees the floor around it, or in a sector ahead."""
 
-    def __init__(self, reach=0.7, half_angle=math.pi):
+    def __init__(self, reach=0.7, half_angle=math.pi, known=False):
         rows, columns = round(ROOM[1] / SIZE), round(ROOM[0] / SIZE)
         self.occupied = np.zeros((rows, columns), dtype=np.bool_)
         self.occupied[[0, -1]] = self.occupied[:, [0, -1]] = True
         self.hidden = np.zeros_like(self.occupied)
-        self.seen = np.zeros_like(self.occupied)
+        self.seen = np.full_like(self.occupied, known)
         self.reach, self.half_angle = reach, half_angle
         row, column = np.indices((rows, columns))
         self.x, self.y = SIZE * (column + 0.5) - 2.0, SIZE * (row + 0.5) - 1.5
@@ -114,22 +114,26 @@ def planned(given=None, seed=1, start=ORIGIN, **values):
     return path
 
 
-def drive(path, room, seconds, follow=True, voltage=None):
-    """Return poses and twists, shape (n, 5), of a robot that is where its reference is.
+def drive(path, room, seconds, voltage=None, robot=None, rate=lambda k: 1.0, change=None):
+    """Return poses and twists, shape (n, 5), of a reference and a robot that is where it is.
 
     voltage : returns that of the battery at a pose
+    robot : pose of a robot that is elsewhere
+    change : called with period and pose before each map, which changes the room
     """
     rows = []
     pose = path._pose
     for k in range(round(seconds / PERIOD)):
+        if change is not None:
+            change(k, pose)
         if k % MAP_PERIOD == 0:
-            room.see(pose)
+            if robot is None:
+                room.see(pose)
             path.set_map(room.grid())
         if voltage is not None and k % round(1.0 / PERIOD) == 0:
             path.observe_battery(voltage(pose))
-        pose, twist = path.advance()
-        if follow:
-            path.observe(pose)
+        pose, twist = path.advance(rate(k))
+        path.observe(robot or pose)
         rows.append((*pose, *twist))
     return np.array(rows)
 
@@ -163,19 +167,13 @@ def test_it_keeps_its_distance_from_whatever_it_has_seen(seed):
 
 
 def test_before_unseen_floor_it_rests_and_looks_to_both_sides():
-    room = Room(half_angle=0.15)
-    unseen = []
-    path = planned()
-    rows = []
-    pose = ORIGIN
-    for k in range(round(60.0 / PERIOD)):
-        if k % MAP_PERIOD == 0:
-            room.see(pose)
-            path.set_map(room.grid())
-            unseen.append(room.distances(~room.seen, np.array([pose]))[0])
-        pose, twist = path.advance()
-        rows.append((*pose, *twist))
-    rows = np.array(rows)
+    room, unseen = Room(half_angle=0.15), []
+
+    def note(k, pose):
+        room.see(pose)
+        unseen.append(room.distances(~room.seen, np.array([pose]))[0])
+
+    rows = drive(planned(), room, 60.0, change=note)
     check_limits(rows)
     assert min(unseen) > KEEP_OUT - SIZE
     turns = rows[:, 3] == 0.0
@@ -194,24 +192,21 @@ def test_what_a_look_does_not_show_is_driven_around():
 
 
 def test_what_is_placed_ahead_of_it_is_not_touched():
-    room = Room()
-    room.seen[:] = True
-    generator = np.random.default_rng(4)
-    path, pose, rows = planned(), ORIGIN, []
-    for k in range(round(60.0 / PERIOD)):
+    room = Room(known=True)
+    generator, away = np.random.default_rng(4), []
+
+    def place(k, pose):
+        away.append(room.distances(room.occupied, np.array([pose]))[0])
         if k % 100 == 99:
             angle = pose.yaw + generator.uniform(-0.5, 0.5)
             room.occupied[1:-1, 1:-1] = False
             room.occupied |= room.near(
                 pose.x + 0.45 * math.cos(angle), pose.y + 0.45 * math.sin(angle), 0.1
             )
-        if k % MAP_PERIOD == 0:
-            path.set_map(room.grid())
-        pose, twist = path.advance()
-        rows.append((*pose, *twist, room.distances(room.occupied, np.array([pose]))[0]))
-    rows = np.array(rows)
+
+    rows = drive(planned(), room, 60.0, change=place)
     check_limits(rows)
-    assert rows[:, 5].min() > 0.12
+    assert min(away) > 0.12
     assert length(rows) > 4.0  # something is in its way every 5 s
 
 
@@ -228,8 +223,7 @@ def test_old_places_are_visited_again():
     """The given path is a small circle: what else is entered is due to the visits."""
     shares = []
     for distance in (0.0, 3.0):
-        room = Room()
-        room.seen[:] = True
+        room = Room(known=True)
         rows = drive(planned(circle(0.3).__next__, revisit_distance=distance), room, 60.0)
         cells = np.floor(rows[:, :2] / 0.3).astype(int)
         shares.append(len({*map(tuple, cells.tolist())}) / (3.4 * 2.4 / 0.09))
@@ -240,8 +234,7 @@ def test_old_places_are_visited_again():
 @functools.cache
 def drive_by(thing, seconds):
     """Return places from 5 s on, when a robot that drives in a circle is to look at something."""
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     room.occupied |= room.near(1.1, 0.2, 0.1)
     path = planned(circle(0.3).__next__, revisit_distance=0.0)
     rows = [drive(path, room, 5.0)]
@@ -270,8 +263,7 @@ def test_what_contradicts_the_map_is_looked_at_once_a_minute(thing):
 
 def test_what_is_named_no_more_is_looked_at_no_more():
     """Of a localizer that has fallen silent: it was looked at once a minute, for ever."""
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path, thing = planned(circle(0.3).__next__, revisit_distance=0.0), (-1.4, -0.9)
     path.look_at(np.array([thing]))
     drive(path, room, 110.0)
@@ -281,8 +273,7 @@ def test_what_is_named_no_more_is_looked_at_no_more():
 
 def test_what_cannot_be_looked_at_does_not_hold_it_up():
     """Behind a wall, beyond the arena, where a view is, and several at once."""
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     room.occupied |= np.abs(room.x - 1.0) < 0.03
     path = planned(circle(0.3).__next__, revisit_distance=0.0)
     node = [-2.0 + 60.5 * SIZE, -1.5 + 50.5 * SIZE]  # of the search: at no distance from itself
@@ -295,8 +286,7 @@ def test_what_cannot_be_looked_at_does_not_hold_it_up():
 
 
 def test_a_goal_is_led_to_before_what_contradicts_the_map():
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path = planned(circle(0.3).__next__, revisit_distance=0.0)
     path.go_to((1.4, 0.8))
     path.look_at(np.array([[-1.4, -0.8]]))
@@ -308,8 +298,7 @@ def test_a_goal_is_led_to_before_what_contradicts_the_map():
 
 
 def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     room.occupied |= room.near(0.5, 0.4, 0.2)
     ring = room.near(-1.0, -0.6, 0.5) & ~room.near(-1.0, -0.6, 0.38)
     room.occupied |= ring
@@ -333,8 +322,7 @@ def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
 def test_what_is_planned_after_a_goal_does_not_lead_past_it():
     """The last half metre of the plan is smoothed again: it passed a goal by 0.1 m, as visited."""
     goal = (-1.35, 1.0)
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path = planned(revisit_distance=0.0)
     path.go_to(goal)
     path.set_map(room.grid())
@@ -347,8 +335,7 @@ def test_what_is_planned_after_a_goal_does_not_lead_past_it():
 def test_a_thing_in_the_way_does_not_make_it_forget_a_goal():
     """What was planned behind it was cut off, and the goal with it."""
     goal = (1.4, 0.0)
-    room = Room(reach=0.5)
-    room.seen[:] = True
+    room = Room(reach=0.5, known=True)
     path = planned(revisit_distance=0.0)
     path.go_to(goal)
     drive(path, room, 0.5)
@@ -390,8 +377,7 @@ def test_with_a_low_battery_it_is_charged_and_goes_on(seed):
 @pytest.mark.parametrize('voltage', [math.nan, math.inf, 0.0])
 def test_what_is_no_voltage_changes_nothing(voltage):
     """0 V, of a driver that measures none, led to the charger, and inf on from there."""
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path = planned(charging__place=CHARGER, charging__min_voltage=10.0)
     drive(path, room, 7.0, voltage=lambda pose: voltage)
     assert not path.observe_battery(voltage)
@@ -405,8 +391,7 @@ def test_what_is_no_voltage_changes_nothing(voltage):
 
 
 def test_only_a_voltage_that_lasts_calls_for_the_charger():
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path = planned(charging__place=CHARGER, charging__min_voltage=10.0)
     sags = iter([9.0, 9.0, 9.0, 9.0, 9.0, 10.5] * 3 + [math.nan] * 30)
     drive(path, room, 30.0, voltage=lambda pose: next(sags))
@@ -417,10 +402,7 @@ def test_only_a_voltage_that_lasts_calls_for_the_charger():
     drive(path, room, 20.0, voltage=lambda pose: 12.0)
     assert path.at_charging_place
     # Pushed away, it returns.
-    away = Pose(-0.4, 0.2, 0.0)
-    for _ in range(round((PATIENCE + 1.0) / PERIOD)):
-        path.advance()
-        path.observe(away)
+    drive(path, room, PATIENCE + 1.0, robot=Pose(-0.4, 0.2, 0.0))
     rows = drive(path, room, 30.0, voltage=lambda pose: math.nan)
     assert path.at_charging_place
     assert np.hypot(*(rows[-1, :2] - CHARGER)) < 0.06
@@ -461,8 +443,7 @@ def test_a_path_of_any_spacing_goes_on(spacing):
 
 def test_equal_seeds_give_equal_paths_and_others_do_not():
     def positions(seed):
-        room = Room()
-        room.seen[:] = True
+        room = Room(known=True)
         return drive(planned(seed=seed, revisit_distance=0.5), room, 8.0)
 
     first = positions(1)
@@ -503,12 +484,9 @@ def test_a_robot_that_has_nowhere_to_go_is_boxed_in():
 
 def test_a_robot_that_does_not_turn_to_look_is_not_boxed_in():
     """Its controller is disabled, say: what the looks were to show is not seen."""
-    room, path = Room(half_angle=0.1), planned()
-    for k in range(round(3.0 * NOWHERE_TIME / PERIOD)):
-        if k % MAP_PERIOD == 0:
-            path.set_map(room.grid())
-        path.advance()
-        path.observe(Pose(0.0, 0.0, 2.0))
+    path = planned()
+    for _ in range(round(3.0 * NOWHERE_TIME)):
+        drive(path, Room(half_angle=0.1), 1.0, robot=Pose(0.0, 0.0, 2.0))
         assert not path.boxed_in
 
 
@@ -530,35 +508,23 @@ def test_a_robot_too_near_to_what_is_marked_leaves(direction):
 
 
 def test_it_begins_anew_at_a_robot_that_does_not_come():
-    room = Room()
-    room.seen[:] = True
+    room = Room(known=True)
     path = planned()
     drive(path, room, 5.0)
     place = Pose(-0.9, -0.6, 2.0)
-    rows = []
-    for k in range(round((PATIENCE + 2.0) / PERIOD)):
-        if k % MAP_PERIOD == 0:
-            path.set_map(room.grid())
-        path.observe(place)
-        rows.append(path.advance(0.0)[0])
-    away = np.array([math.dist(each[:2], place[:2]) for each in rows])
+    rows = drive(path, room, PATIENCE + 2.0, robot=place, rate=lambda k: 0.0)
+    away = np.hypot(*(rows[:, :2] - place[:2]).T)
     assert (away[: round(PATIENCE / PERIOD) - 1] > FAR_AWAY).all()
-    assert rows[-1] == pytest.approx(place)
+    assert rows[-1, :3] == pytest.approx(place)
     assert length(drive(path, room, 20.0)) > 2.0
 
 
 def test_a_pause_stops_it_within_the_limits_at_any_moment():
-    room = Room(half_angle=0.15)
-    path, pose, rows = planned(), ORIGIN, []
-    for k in range(round(20.0 / PERIOD)):
-        if k % MAP_PERIOD == 0:
-            room.see(pose)
-            path.set_map(room.grid())
-        pose, twist = path.advance(0.0 if k % 60 > 40 else 1.0)
-        rows.append((*pose, *twist))
-        if k % 60 == 59:
-            assert twist == STANDSTILL
-    check_limits(np.array(rows))
+    rows = drive(
+        planned(), Room(half_angle=0.15), 20.0, rate=lambda k: 0.0 if k % 60 > 40 else 1.0
+    )
+    assert not rows[59::60, 3:].any()
+    check_limits(rows)
 
 
 def test_only_portraits_are_planned():

@@ -265,6 +265,17 @@ def turning(time):
     return 0.1 + 0.08 * math.sin(2.5 * time), 0.7 + 0.5 * math.sin(0.9 * time)
 
 
+def seen_late(steps):
+    """Return what shows, of a robot, the pose of so many messages ago."""
+    poses = []
+
+    def moved(k, pose, generator):
+        poses.append(pose)
+        return poses[max(k - steps, 0)]
+
+    return moved
+
+
 def delayed(steps):
     def changed(k, pose, history):
         return history[max(k - steps, 0)]
@@ -480,16 +491,10 @@ def test_a_twist_of_the_other_sign_is_found_soon(which, seed):
 @pytest.mark.parametrize('swing', [2.0, 4.0])
 def test_a_late_pose_of_a_robot_that_swings_is_not_reversed(late, swing):
     """Whenever it turns back, the signs are opposite for as long as the pose is late."""
-    poses = []
-
-    def seen(k, pose, generator):
-        poses.append(pose)
-        return poses[max(k - late, 0)]
-
     twist, _ = contradicted(
         delayed(0),
         seconds=6.0,
-        moved=seen,
+        moved=seen_late(late),
         motion=lambda time: (0.2 * math.sin(swing * time), math.sin(swing * time)),
     )
     assert ' is -' not in twist.problem()
@@ -547,18 +552,11 @@ REPEATED = {
 @pytest.mark.parametrize('repeated', REPEATED)
 def test_a_twist_that_is_equal_for_another_reason_is_not_held(repeated, late):
     changed, motion = REPEATED[repeated]
-    poses = []
-
-    def seen(k, pose, generator):
-        poses.append(pose)
-        return poses[max(k - late, 0)]
-
     for seconds in (2.0, 5.0, 9.0):
         twist, _ = contradicted(
-            changed, seconds=seconds, noise=(0.0, 0.0), motion=motion, moved=seen
+            changed, seconds=seconds, noise=(0.0, 0.0), motion=motion, moved=seen_late(late)
         )
         assert 'are held' not in twist.problem()
-        poses.clear()
 
 
 SEEN = {

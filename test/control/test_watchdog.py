@@ -696,21 +696,20 @@ def test_nothing_is_said_of_wheels_that_follow_their_commands(delay):
     assert _problems(lambda time, given: given, seconds=120.0, delay=delay) == set()
 
 
-def test_a_wheel_that_is_dead_for_a_moment_is_named():
-    """A wheel without commands for 0.3 s made ten times the error, and nothing was said."""
-    found = _problems(lambda time, given: 0.0 if 4.0 <= time < 4.3 else given)
+@pytest.mark.parametrize(
+    ('of_right', 'why'),
+    [
+        (lambda time, given: 0.0 if 4.0 <= time < 4.3 else given, 'commands of it are lost'),
+        (lambda time, given: min(max(given, -4.0), 4.0), 'it gets no faster'),
+    ],
+)
+def test_a_wheel_that_is_dead_or_at_a_limit_is_named(of_right, why):
+    """Nothing was said of ten times the error, or a wrong radius, or another dead time."""
+    found = _problems(of_right)
     assert found
     for text in found:
         assert text.startswith('the right wheel had ')
-        assert 'commands of it are lost' in text
-
-
-def test_a_wheel_at_a_limit_of_the_robot_is_named():
-    """It was said to have a wrong radius, or another dead time."""
-    found = _problems(lambda time, given: min(max(given, -4.0), 4.0))
-    assert found
-    for text in found:
-        assert 'it gets no faster' in text
+        assert why in text
 
 
 def test_a_factor_of_the_measured_speeds_is_no_dead_wheel():
