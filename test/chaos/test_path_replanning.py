@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
+from t3mpc_ros.chaos.path_plan import GOAL_MISS
 from t3mpc_ros.chaos.path_replanning import (
     FAR_AWAY,
-    GOAL_MISS,
     NOWHERE_TIME,
     PATIENCE,
     PlannedPath,
