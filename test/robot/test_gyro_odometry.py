@@ -316,14 +316,6 @@ def test_a_bias_jump_in_motion_is_in_the_covariance(part):
     assert sure == pytest.approx(10.0 * DEGREE / math.sqrt(3.0), rel=0.3)
 
 
-def test_large_bias_jump_in_motion_is_flagged():
-    robots, odometries = Robots(1, 9), make_odometries()
-    robots.stand(odometries, 3.0)
-    for time in robots.drive(odometries, run([(6.0, 5.0, 4.0)])[:, :, None]):
-        robots.bias += 20.0 * DEGREE * (abs(time - 2.0) < 0.5 * PERIOD)
-        assert odometries[0].slipping == (time > 2.3) or 2.0 < time < 2.3
-
-
 def reversals(acceleration=200.0, top=8.0):
     """Return speeds (ms, 2, 1): yaw between ±top every 150 ms, at 0.1 m/s, from rest to rest."""
     yaw, forward, now = [], [], 0.0
@@ -552,25 +544,6 @@ def test_non_finite_input_is_rejected_without_side_effects(bad):
     assert np.array_equal(odometry.covariance, covariance)
     with pytest.raises(ParameterError, match='slip_threshold'):
         with_constants(GyroOdometryParameters, standstill_spread=0.01)(slip_threshold=0.02)
-
-
-def test_gyro_failure_falls_back_to_wheel_odometry():
-    robots, odometries = Robots(1, 10), make_odometries()
-    odometry, plain = odometries[0], WheelOdometry(WheelOdometryParameters(), GEOMETRY)
-    robots.stand(odometries, 2.0)
-    variances = []
-    for index in range(2000):
-        robots.move(3.0 * RADIUS * PERIOD, 4.0 * RADIUS * PERIOD, PERIOD)
-        if index == 1000:
-            plain.reset(odometry.pose)
-        sample = robots.gyro()[0]
-        odometry.update(0.03, 0.04, sample if index < 1000 else None, PERIOD)
-        if index >= 1000:
-            plain.update(0.03, 0.04)
-        variances.append(odometry.covariance[2, 2])
-    assert odometry.pose == pytest.approx(plain.pose, abs=1e-9)
-    assert variances[1999] - variances[1000] > 10.0 * (variances[999] - variances[0])
-    assert odometry.calibrated
 
 
 def test_uncertainty_grows_in_motion_not_at_standstill():
