@@ -490,6 +490,17 @@ def test_a_robot_that_does_not_turn_to_look_is_not_boxed_in():
         assert not path.boxed_in
 
 
+@pytest.mark.parametrize(('aside', 'boxed_in'), [(0.3, True), (0.4, False)])
+def test_only_a_robot_that_faces_as_its_reference_is_boxed_in(aside, boxed_in):
+    room = Room()
+    room.occupied |= room.near(0.0, 0.0, 0.45) & ~room.near(0.0, 0.0, 0.3)
+    path = planned()
+    drive(path, room, 5.0)
+    assert path.advance()[1] == STANDSTILL
+    drive(path, room, 2.0 * NOWHERE_TIME, robot=path._pose._replace(yaw=path._pose.yaw + aside))
+    assert path.boxed_in == boxed_in
+
+
 @pytest.mark.parametrize('direction', few_of([1.0, -1.5, 2.5]))
 def test_a_robot_too_near_to_what_is_marked_leaves(direction):
     """A place marked a hand's breadth before it, which was none, kept it there for ever."""
