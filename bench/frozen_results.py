@@ -167,6 +167,7 @@ def sample(count: int) -> Iterator[tuple[str, object, object]]:
     for scenario, name, old in random.Random(count).sample(runs, count):
         numbers = measured_run((scenario, methods_for(scenario.robot)[name]))
         print(f'{scenario}, {name}', flush=True)
+        del old['seed']
         new = {key: value for key, value in numbers.items() if key in old}
         yield from differences(old, new, f'/{scenario}/{name}')
 
