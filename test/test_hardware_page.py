@@ -16,21 +16,17 @@
 import math
 from pathlib import Path
 import re
-import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
 
+from docs import drawings, schematic
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.append(str(ROOT / 'docs'))
-import drawings  # noqa: E402
-import schematic  # noqa: E402
-
 PAGE = ROOT / 'docs' / 'hardware.md'
 SHEETS = ('power', 'robot', 'radio')
 
